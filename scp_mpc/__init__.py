@@ -1,0 +1,55 @@
+"""Real-time model predictive control among moving, Gaussian-predicted obstacles."""
+
+from importlib.metadata import version
+
+from scp_mpc.control import MPC, CircularReference
+from scp_mpc.errors import (
+    BoundsError,
+    CovarianceError,
+    InvalidArgumentError,
+    NotFiniteError,
+    ScpMpcError,
+    ShapeError,
+    TooManyObstaclesError,
+)
+from scp_mpc.obstacles import (
+    CircularObstacle,
+    ConstantVelocityPredictor,
+    ObstaclePrediction,
+    ReportPredictor,
+)
+from scp_mpc.problem import Margin, Problem
+from scp_mpc.robots import DoubleIntegrator, LinearModel
+from scp_mpc.settings import QPSettings, Settings
+from scp_mpc.solver import SCP, Iterate, Plan, Status
+from scp_mpc.trajectory import Trajectory
+
+__version__ = version("scp-mpc")
+
+__all__ = [
+    "MPC",
+    "SCP",
+    "BoundsError",
+    "CircularObstacle",
+    "CircularReference",
+    "ConstantVelocityPredictor",
+    "CovarianceError",
+    "DoubleIntegrator",
+    "InvalidArgumentError",
+    "Iterate",
+    "LinearModel",
+    "Margin",
+    "NotFiniteError",
+    "ObstaclePrediction",
+    "Plan",
+    "Problem",
+    "QPSettings",
+    "ReportPredictor",
+    "ScpMpcError",
+    "Settings",
+    "ShapeError",
+    "Status",
+    "TooManyObstaclesError",
+    "Trajectory",
+    "__version__",
+]

@@ -1,0 +1,106 @@
+"""Validated float64 arrays: what crosses the public border is copied, checked and frozen here."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scp_mpc.errors import CovarianceError, InvalidArgumentError, NotFiniteError, ShapeError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+
+def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
+    """Return `value` as a finite, C-contiguous float64 copy of one of the given shapes.
+
+    Args:
+        argument: Name used in error messages.
+        value: Anything numpy can turn into an array of numbers.
+        shapes: Accepted shapes; -1 stands for any length. No shape means that any will do.
+
+    Raises:
+        InvalidArgumentError: The value is not numeric.
+        ShapeError: The shape fits none of `shapes`.
+        NotFiniteError: An entry is NaN or infinite.
+    """
+    try:
+        raw = np.asarray(value)
+        if raw.dtype.kind not in "biuf":
+            raise TypeError(f"dtype {raw.dtype}")
+        array = np.array(raw, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InvalidArgumentError(argument, f"not an array of real numbers ({error})") from None
+    if shapes and not any(_fits(array.shape, shape) for shape in shapes):
+        wanted = " or ".join(str(shape).replace("-1", "any") for shape in shapes)
+        raise ShapeError(argument, f"shape {array.shape} does not fit {wanted}")
+    require_finite(argument, array)
+    return array
+
+
+def require_finite(argument: str, array: FloatArray) -> None:
+    """Raise `NotFiniteError` with the place and the value of the first entry that is not finite."""
+    finite = np.isfinite(array)
+    if not finite.all():
+        place = tuple(int(i) for i in np.argwhere(~finite)[0])
+        where = f" at index {place}" if place else ""
+        raise NotFiniteError(argument, f"{array[place]}{where} is not finite")
+
+
+def as_number(argument: str, value: Any) -> float:
+    """Return `value` as a finite float.
+
+    Raises:
+        InvalidArgumentError: It is not one number, or not finite.
+    """
+    return float(as_array(argument, value, ()))
+
+
+def frozen(array: FloatArray) -> FloatArray:
+    """Mark an array read-only and return it."""
+    array.setflags(write=False)
+    return array
+
+
+def as_weight(argument: str, value: ArrayLike, size: int) -> FloatArray:
+    """Return a weight matrix (size, size) from its diagonal or its full symmetric form.
+
+    Raises:
+        ShapeError: Neither `(size,)` nor `(size, size)`.
+        CovarianceError: The matrix is not symmetric positive semi-definite.
+    """
+    array = as_array(argument, value, (size,), (size, size))
+    matrix = np.diag(array) if array.ndim == 1 else array
+    require_positive_semidefinite(argument, matrix[None])
+    return frozen(np.ascontiguousarray(matrix))
+
+
+def require_positive_semidefinite(argument: str, matrices: FloatArray) -> None:
+    """Check a stack (n, d, d) of symmetric positive semi-definite matrices.
+
+    Asymmetry and negative eigenvalues are forgiven up to 1e-9 of the largest entry: that much is
+    rounding in a product such as J Sigma J'.
+
+    Raises:
+        CovarianceError: With the index of the first offender and its offending number.
+    """
+    allowed = 1e-9 * np.abs(matrices).max(axis=(-2, -1), initial=0.0)
+    asymmetry = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
+    if (asymmetry > allowed).any():
+        at = int(np.argmax(asymmetry > allowed))
+        raise CovarianceError(argument, f"matrix {at} is not symmetric (by {asymmetry[at]:.3g})")
+    smallest = np.linalg.eigvalsh(matrices)[..., 0]
+    if (smallest < -allowed).any():
+        at = int(np.argmax(smallest < -allowed))
+        raise CovarianceError(
+            argument,
+            f"matrix {at} is not positive semi-definite (smallest eigenvalue {smallest[at]:.3g})",
+        )
+
+
+def _fits(shape: Sequence[int], wanted: Sequence[int]) -> bool:
+    return len(shape) == len(wanted) and all(
+        w in (-1, n) for n, w in zip(shape, wanted, strict=True)
+    )

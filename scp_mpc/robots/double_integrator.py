@@ -1,0 +1,36 @@
+"""The report's robot: a point mass driven by accelerations (III.A, equation 9)."""
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray, as_number
+from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.robots.linear import LinearModel
+
+
+class DoubleIntegrator(LinearModel):
+    """Point mass with x = [p1, v1, p2, v2, ...] and u = [a1, a2, ...].
+
+    Each axis is discretised exactly for an input held over the interval:
+    p+ = p + dt v + dt^2/2 a,  v+ = v + dt a.
+
+    Args:
+        dt: Sampling time [s].
+        dim: Dimension of the workspace, 2 or 3.
+    """
+
+    def __init__(self, dt: float, dim: int = 2) -> None:
+        """Build A and B as block diagonals over the axes."""
+        if dim not in (2, 3):
+            raise InvalidArgumentError("dim", f"{dim} is neither 2 nor 3")
+        dt = as_number("dt", dt)
+        axes = np.eye(dim)
+        super().__init__(
+            A=np.kron(axes, [[1.0, dt], [0.0, 1.0]]),
+            B=np.kron(axes, [[dt**2 / 2], [dt]]),
+            dt=dt,
+            position=np.arange(0, 2 * dim, 2),
+        )
+
+    def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Interleave positions (..., d) and velocities (..., d) into states (..., 2 d)."""
+        return np.stack([position, velocity], axis=-1).reshape(*np.shape(position)[:-1], -1)

@@ -1,0 +1,151 @@
+"""The two inflations of the s-sigma ellipsoid by the radii of robot and obstacle.
+
+Notation:
+    p       (N, d)      robot positions at stages 1 .. N [m]
+    s       (M,)        size of each obstacle's ellipsoid [standard deviations]
+    y       (M, N, d)   R'(p - mu), position in the ellipsoid's axes [m]
+    g       (M, N)      constraint function: outside the no-go set means g(p, s) >= 0 [m]
+
+Other symbols as in `no_go.py`. Both inflations return g together with its linearisation.
+"""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.safety.ellipsoid import signed_distance
+from scp_mpc.safety.halfspaces import HalfSpaces
+from scp_mpc.safety.no_go import NoGoSets
+
+
+class Inflation(ABC):
+    """A shape for the no-go set: how the s-sigma ellipsoid grows by the radii.
+
+    Args:
+        reference: s_ref, at which `clearance` is measured and lengths are scaled.
+    """
+
+    def __init__(self, reference: float) -> None:
+        """Remember the reference size."""
+        self._reference = reference
+
+    @abstractmethod
+    def linearise(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
+    ) -> HalfSpaces:
+        """Linearise g about positions (N, d) and s (M,).
+
+        `start` (M, d) holds each obstacle's offset p_0 - mu_0 now. Where the nearest side of the
+        set is not unique, the offset one stage earlier decides; at p = mu that is the direction
+        opposite to the relative velocity: the side from which the robot comes.
+        """
+
+    @abstractmethod
+    def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+        """Signed distance (M, N) [m] to the no-go set at s = s_ref; plus infinity if inactive."""
+
+
+class ExactInflation(Inflation):
+    """Ellipsoid (+) ball, the Minkowski sum: g = sd(p, s) - r.
+
+    sd(p, s) = max_{|n|=1} n'(p - mu) - s sqrt(n' Sigma n) is jointly convex, so that
+
+        n'(p - mu) - s sqrt(n' Sigma n) >= r
+
+    lies inside the true feasible set for every unit n (convex-concave procedure: Lipp and Boyd,
+    2016). With s = Phi^-1(1 - delta) the same half-space bounds the probability of a collision by
+    delta (Blackmore, Ono and Williams, 2011).
+    """
+
+    def linearise(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
+    ) -> HalfSpaces:
+        """See the base class; normals are unit vectors."""
+        offsets = positions - sets.means
+        y = sets.to_eigenframe(offsets)
+        side = sets.to_eigenframe(_one_stage_earlier(offsets, start))
+        sd, n = signed_distance(y, s[:, None, None] * sets.deviations, side)
+        slope = -np.sqrt(np.square(sets.deviations * n).sum(axis=-1))
+        normal = sets.to_world(n)
+        radii = sets.radii[:, None]
+        offset = np.einsum("mnd,mnd->mn", normal, sets.means) + radii
+        return _masked(sets, normal, slope, offset, sd - radii)
+
+    def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+        """See the base class."""
+        y = sets.to_eigenframe(positions - sets.means)
+        sd, _ = signed_distance(y, self._reference * sets.deviations)
+        return np.where(sets.active[:, None], sd - sets.radii[:, None], np.inf)
+
+
+class AxesInflation(Inflation):
+    """The report's ellipse with semi-axes e_l = s sigma_l + r: equations (5a) and (14).
+
+    g = c (|y / e| - 1), where c is the shortest semi-axis at s_ref, so that g is in metres and
+    never exceeds the distance to the ellipse there. It is the norm that is linearised, not its
+    square, whose tangent stands too far out by (1 + |y/e|^2) / (2 |y/e|).
+
+    Not safe: the ellipse lies inside ellipse (+) disc and touches it on the axes only (Brito et
+    al., 2019). Kept to reproduce the report. g is convex in p but not jointly in (p, s).
+    """
+
+    def linearise(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
+    ) -> HalfSpaces:
+        """See the base class."""
+        offsets = positions - sets.means
+        y = sets.to_eigenframe(offsets)
+        e = s[:, None, None] * sets.deviations + sets.radii[:, None, None]
+        scale = self._scale(sets)
+        w = y / e
+        at_centre = np.abs(w).max(axis=-1, keepdims=True) < 1e-12
+        if at_centre.any():
+            side = sets.to_eigenframe(_one_stage_earlier(offsets, start))
+            w = np.where(at_centre, _nudged(side / e), w)
+        norm = np.sqrt(np.square(w).sum(axis=-1))
+        gradient = scale[..., None] * w / (norm[..., None] * e)
+        slope = -(gradient * w * sets.deviations).sum(axis=-1)
+        value = scale * (norm - 1)
+        normal = sets.to_world(gradient)
+        offset = np.einsum("mnd,nd->mn", normal, positions) + slope * s[:, None] - value
+        return _masked(sets, normal, slope, offset, value)
+
+    def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+        """See the base class."""
+        y = sets.to_eigenframe(positions - sets.means)
+        e = self._reference * sets.deviations + sets.radii[:, None, None]
+        sd, _ = signed_distance(y, e)
+        return np.where(sets.active[:, None], sd, np.inf)
+
+    def _scale(self, sets: NoGoSets) -> FloatArray:
+        return self._reference * sets.deviations.min(axis=-1) + sets.radii[:, None]
+
+
+def _one_stage_earlier(offsets: FloatArray, start: FloatArray) -> FloatArray:
+    return np.concatenate([start[:, None], offsets[:, :-1]], axis=1)
+
+
+def _nudged(direction: FloatArray) -> FloatArray:
+    """Vectors of length 1e-12 along `direction`, or along the first axis where that vanishes."""
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    first = np.eye(direction.shape[-1])[0]
+    return 1e-12 * np.where(length > 0, direction / np.where(length > 0, length, 1.0), first)
+
+
+def _masked(
+    sets: NoGoSets,
+    normal: FloatArray,
+    slope: FloatArray,
+    offset: FloatArray,
+    value: FloatArray,
+) -> HalfSpaces:
+    if sets.active.all():
+        return HalfSpaces(normal, slope, offset, value)
+    on = sets.active[:, None]
+    return HalfSpaces(
+        np.where(on[..., None], normal, 0.0),
+        np.where(on, slope, 0.0),
+        np.where(on, offset, -np.inf),
+        np.where(on, value, np.inf),
+    )

@@ -1,0 +1,83 @@
+"""The s-sigma ellipsoids of all obstacles along the horizon, stacked.
+
+Notation:
+    M, N, d     obstacle slots, horizon, dimension of the workspace
+    mu      (M, N, d)       means at stages 1 .. N [m]
+    R       (M, N, d, d)    eigenvectors of Sigma in columns
+    sigma   (M, N, d)       square roots of Sigma's eigenvalues: standard deviations [m]
+    r       (M,)            robot radius + obstacle radius [m]
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scp_mpc.arrays import BoolArray, FloatArray
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+
+
+@dataclass(frozen=True, eq=False)
+class NoGoSets:
+    """Eigen-decomposed predictions of M obstacle slots at N stages.
+
+    Slots without an obstacle are inactive: they hold unit values, and what is computed from them
+    is discarded through `active`.
+    """
+
+    means: FloatArray
+    rotations: FloatArray
+    deviations: FloatArray
+    radii: FloatArray
+    active: BoolArray
+
+    @classmethod
+    def from_predictions(
+        cls,
+        predictions: Sequence[ObstaclePrediction],
+        robot_radius: float,
+        slots: int,
+        horizon: int,
+        dim: int,
+    ) -> "NoGoSets":
+        """Stack rows 1 .. N of the predictions; the remaining slots stay inactive."""
+        return cls._stacked(predictions, slice(1, horizon + 1), robot_radius, slots, horizon, dim)
+
+    @classmethod
+    def now(cls, predictions: Sequence[ObstaclePrediction], robot_radius: float) -> "NoGoSets":
+        """Stack row 0 of the predictions, as one stage."""
+        dim = predictions[0].dim if predictions else 2
+        return cls._stacked(predictions, slice(0, 1), robot_radius, len(predictions), 1, dim)
+
+    @classmethod
+    def _stacked(
+        cls,
+        predictions: Sequence[ObstaclePrediction],
+        rows: slice,
+        robot_radius: float,
+        slots: int,
+        horizon: int,
+        dim: int,
+    ) -> "NoGoSets":
+        count = len(predictions)
+        means = np.zeros((slots, horizon, dim))
+        rotations = np.zeros((slots, horizon, dim, dim))
+        rotations[count:] = np.eye(dim)
+        deviations = np.ones((slots, horizon, dim))
+        radii = np.zeros(slots)
+        if count:
+            variances, rotations[:count] = np.linalg.eigh(
+                np.stack([o.covariances[rows] for o in predictions])
+            )
+            deviations[:count] = np.sqrt(np.maximum(variances, 0.0))
+            means[:count] = np.stack([o.means[rows] for o in predictions])
+            radii[:count] = robot_radius + np.array([o.radius for o in predictions])
+        return cls(means, rotations, deviations, radii, np.arange(slots) < count)
+
+    def to_eigenframe(self, offsets: FloatArray) -> FloatArray:
+        """Rotate offsets (M, N, d) from the world into the ellipsoids' axes: R' v."""
+        return np.einsum("mnji,mnj->mni", self.rotations, offsets)
+
+    def to_world(self, vectors: FloatArray) -> FloatArray:
+        """Rotate vectors (M, N, d) from the ellipsoids' axes into the world: R v."""
+        return np.einsum("mnij,mnj->mni", self.rotations, vectors)

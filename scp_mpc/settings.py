@@ -1,0 +1,79 @@
+"""Settings of the solver: how it works, never what problem it solves."""
+
+from dataclasses import dataclass, field
+
+from scp_mpc.arrays import as_number
+from scp_mpc.errors import BoundsError, InvalidArgumentError
+
+
+@dataclass(frozen=True)
+class QPSettings:
+    """Settings of the quadratic program's solvers.
+
+    Attributes:
+        accuracy: KKT residual that a QP's solution must reach before it is used; what OSQP does
+            not bring there goes to the rescue solver.
+        eps: OSQP's absolute and relative tolerance; polishing takes it from there to `accuracy`.
+        max_iterations: OSQP's iterations before the rescue solver is asked.
+        check_interval: Iterations between OSQP's checks for termination.
+        rho: OSQP's initial step size.
+        rescue: Name of the rescue solver, any sparse one that qpsolvers knows; None for none.
+    """
+
+    accuracy: float = 1e-7
+    eps: float = 1e-4
+    max_iterations: int = 300
+    check_interval: int = 10
+    rho: float = 0.1
+    rescue: str | None = "piqp"
+
+    def __post_init__(self) -> None:
+        """Check every number, because OSQP does not."""
+        for name in ("accuracy", "eps", "rho"):
+            require_positive(name, getattr(self, name))
+        for name in ("max_iterations", "check_interval"):
+            require_count(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the sequential convex programming.
+
+    Attributes:
+        tolerance: KKT residual of the original problem at which a plan is certified.
+        max_iterations: Convex subproblems per control step at most.
+        sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
+        sides_interval: Control steps between two such attempts while it keeps shaping the plan.
+        qp: Settings of the quadratic program's solvers.
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 40
+    sides: bool = True
+    sides_interval: int = 2
+    qp: QPSettings = field(default_factory=QPSettings)
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        require_positive("tolerance", self.tolerance)
+        require_count("max_iterations", self.max_iterations)
+        require_count("sides_interval", self.sides_interval)
+        if self.qp.accuracy > self.tolerance:
+            raise BoundsError(
+                "qp.accuracy",
+                f"{self.qp.accuracy:g} is coarser than the tolerance {self.tolerance:g}",
+            )
+
+
+def require_positive(argument: str, value: float) -> None:
+    """Raise `BoundsError` unless `value` is a positive finite number."""
+    if as_number(argument, value) <= 0:
+        raise BoundsError(argument, f"{value} is not positive")
+
+
+def require_count(argument: str, value: int) -> None:
+    """Raise unless `value` is a whole number of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InvalidArgumentError(argument, f"{value!r} is not a whole number")
+    if value < 1:
+        raise BoundsError(argument, f"{value} is less than 1")

@@ -1,0 +1,70 @@
+"""One iterate of the sequential convex programming, in the words of the problem.
+
+Notation:
+    X (N+1, nx)     states              s       (M,)    sizes of the ellipsoids
+    U (N, nu)       inputs              slack   (M, N)  violation per obstacle and stage [m]
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.robots.linear import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class Multipliers:
+    """Multipliers of the constraints: negative at lower, positive at upper bounds.
+
+    Attributes:
+        dynamics: (N, nx) of x_{i+1} - A x_i - B u_i = 0.
+        inputs: (N, nu) of the input bounds.
+        margin: (M,) of the bounds on s.
+        obstacles: (M, N) of the obstacles' constraints, never positive.
+        slack: (M, N) of slack = 0, or of slack >= 0 where it is free.
+    """
+
+    dynamics: FloatArray
+    inputs: FloatArray
+    margin: FloatArray
+    obstacles: FloatArray
+    slack: FloatArray
+
+    def shifted(self) -> "Multipliers":
+        """Move every stage one step earlier and repeat the last one."""
+        return Multipliers(
+            _shifted(self.dynamics, 0),
+            _shifted(self.inputs, 0),
+            self.margin,
+            _shifted(self.obstacles, 1),
+            _shifted(self.slack, 1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """A primal-dual point. Without multipliers only the primal part is warm-started."""
+
+    states: FloatArray
+    inputs: FloatArray
+    s: FloatArray
+    slack: FloatArray
+    multipliers: Multipliers | None = None
+
+    def shifted(self, model: LinearModel) -> "Iterate":
+        """Return the iterate one step later: the last input is held, its end state appended."""
+        last = model.step(self.states[-1], self.inputs[-1])
+        return Iterate(
+            np.concatenate([self.states[1:], last[None]]),
+            _shifted(self.inputs, 0),
+            self.s,
+            _shifted(self.slack, 1),
+            None if self.multipliers is None else self.multipliers.shifted(),
+        )
+
+
+def _shifted(values: FloatArray, axis: int) -> FloatArray:
+    """Drop the first entry along `axis` and repeat the last."""
+    stages = np.minimum(np.arange(values.shape[axis]) + 1, values.shape[axis] - 1)
+    return values.take(stages, axis=axis)

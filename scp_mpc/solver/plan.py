@@ -1,0 +1,84 @@
+"""What the solver returns: a plan, how it ended, and how far it can be trusted."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.solver.iterate import Iterate, Multipliers
+from scp_mpc.solver.program import KKTResiduals
+
+
+class Status(Enum):
+    """How a plan ended, with the sentence that a log should show."""
+
+    CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
+    FEASIBLE = "Iterations ran out; the plan meets every constraint but is not certified optimal."
+    SOFTENED = "No plan meets every constraint; this one violates them least, by its slack."
+    VIOLATING = "Iterations ran out and the plan still enters a no-go set."
+    FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one control step: geometry, writing values, QP solvers, everything."""
+
+    linearise: float
+    update: float
+    solve: float
+    total: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The plan of one control step. M counts the obstacles that were passed.
+
+    Attributes:
+        X: (N+1, nx) states, row 0 the given one.
+        U: (N, nu) inputs.
+        s: (M,) sizes of the obstacles' ellipsoids.
+        slack: (M, N) violation of each obstacle's constraint at stages 1 .. N [m].
+        cost: Value of the objective, slack not included.
+        status: How it ended.
+        kkt: Residuals of the original problem's KKT conditions at this plan.
+        iterations: Subproblems solved on the way to this plan.
+        qps: Quadratic programs in this control step by the solver that finished them.
+        candidates: Rival plans on other sides that were tried; `switched` if one of them won.
+        timing: Seconds spent.
+        iterate: The point with its multipliers, padded to all obstacle slots.
+    """
+
+    X: FloatArray
+    U: FloatArray
+    s: FloatArray
+    slack: FloatArray
+    cost: float
+    status: Status
+    kkt: KKTResiduals
+    iterations: int
+    qps: dict[str, int]
+    candidates: int
+    switched: bool
+    timing: Timing
+    iterate: Iterate
+
+    @property
+    def u0(self) -> FloatArray:
+        """The input (nu,) to apply now."""
+        return self.U[0]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every constraint holds, so that the plan is safe to follow."""
+        return self.status in (Status.CONVERGED, Status.FEASIBLE)
+
+    @property
+    def touches(self) -> bool:
+        """Whether an obstacle shapes the plan: an active constraint, slack, or no certificate."""
+        duals = self.iterate.multipliers
+        return not self.ok or duals is None or bool(duals.obstacles.any())
+
+    @property
+    def multipliers(self) -> Multipliers:
+        """Multipliers of the constraints, padded to all obstacle slots."""
+        assert self.iterate.multipliers is not None
+        return self.iterate.multipliers

@@ -1,0 +1,69 @@
+"""A sparse quadratic program and the KKT residual of a candidate solution.
+
+    minimise 1/2 x'P x + q'x   subject to   lower <= A x <= upper
+
+Sign of the multipliers: P x + q + A'y = 0 with y > 0 at upper and y < 0 at lower bounds.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from scp_mpc.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class KKTResiduals:
+    """How far a point and its multipliers are from satisfying the KKT conditions.
+
+    Attributes:
+        stationarity: Largest entry of |P x + q + A'y|.
+        feasibility: Largest violation of lower <= A x <= upper.
+        complementarity: Largest product of a multiplier and the distance to its bound; the
+            multiplier itself where that bound is infinite.
+    """
+
+    stationarity: float
+    feasibility: float
+    complementarity: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three; NaN counts as infinite."""
+        worst = max(self.stationarity, self.feasibility, self.complementarity)
+        return worst if worst == worst else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticProgram:
+    """The program's data. The patterns of P and A are fixed; all values may be rewritten.
+
+    Attributes:
+        P: (n, n) symmetric positive semi-definite, both triangles, CSC.
+        q: (n,).
+        A: (m, n) CSC.
+        lower: (m,) may hold minus infinity.
+        upper: (m,) may hold infinity.
+    """
+
+    P: sparse.csc_matrix
+    q: FloatArray
+    A: sparse.csc_matrix
+    lower: FloatArray
+    upper: FloatArray
+    _AT: sparse.csr_matrix = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Keep the transpose, which shares its values with A."""
+        object.__setattr__(self, "_AT", self.A.T)
+
+    def residuals(self, x: FloatArray, y: FloatArray) -> KKTResiduals:
+        """Return the KKT residuals of the point x (n,) with multipliers y (m,)."""
+        Ax = self.A @ x
+        stationarity = np.abs(self.P @ x + self.q + self._AT @ y).max()
+        below, above = Ax - self.lower, self.upper - Ax
+        gap = np.where(y < 0, below, above)
+        products = np.abs(y) * np.where(np.isinf(gap), 1.0, np.abs(gap))
+        violation = -min(below.min(), above.min())
+        return KKTResiduals(float(stationarity), max(0.0, float(violation)), float(products.max()))

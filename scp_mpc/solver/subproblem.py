@@ -1,0 +1,170 @@
+"""The convex subproblem: the only file that knows the order of variables and rows.
+
+Notation:
+    z = [x_1 .. x_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MN]
+    rows = [dynamics | input bounds | bounds on s | half-spaces | slack]
+
+    dynamics        x_{i+1} - A x_i - B u_i = 0
+    half-spaces     normal_ji' p_i + slope_ji s_j + slack_ji >= offset_ji
+    slack           slack = 0 (firm) or slack >= 0 at `slack_weight` per metre (soft)
+
+OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
+"""
+
+import numpy as np
+from scipy import sparse
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.problem import Problem
+from scp_mpc.safety.halfspaces import HalfSpaces
+from scp_mpc.solver.iterate import Iterate, Multipliers
+from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
+from scp_mpc.solver.sparse_blocks import SparseBlocks
+
+
+class Subproblem:
+    """The quadratic program about a nominal plan: pattern once, values many times.
+
+    Initialisation: everything that depends on the problem alone, the dynamics included.
+
+    Usage: `write_step` once per control step, `write_half_spaces` once per SCP iteration;
+    `program` then holds the values, and `unpack` turns its solution into an `Iterate`.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        """Lay out variables and rows and write the constant values."""
+        self._problem = problem
+        model, N, M = problem.model, problem.horizon, problem.max_obstacles
+        sizes = (N * model.nx, N * model.nu, M, M * N)
+        self._x, self._u, self._s, self._slack = _slices(sizes)
+        n = sum(sizes)
+        sizes = (N * model.nx, N * model.nu, M, M * N, M * N)
+        self._dynamics, self._inputs, self._margin, self._spaces, self._pins = _slices(sizes)
+        m = sum(sizes)
+        A, self._places = self._constraints((m, n))
+        self.program = QuadraticProgram(
+            self._hessian(), np.zeros(n), A, np.full(m, -np.inf), np.full(m, np.inf)
+        )
+        lower, upper = self.program.lower, self.program.upper
+        lower[self._dynamics] = upper[self._dynamics] = 0.0
+        lower[self._inputs] = np.tile(problem.u_min, N)
+        upper[self._inputs] = np.tile(problem.u_max, N)
+        lower[self._margin], upper[self._margin] = problem.margin.lower, problem.margin.upper
+        lower[self._pins] = 0.0
+        self.program.q[self._s] = -2 * problem.margin.weight * problem.margin.reference
+        self._x0 = np.zeros(model.nx)
+        self.soft = False
+
+    @property
+    def soft(self) -> bool:
+        """Whether the slack is free (soft) or pinned to zero (firm)."""
+        return self._soft
+
+    @soft.setter
+    def soft(self, soft: bool) -> None:
+        self._soft = soft
+        self.program.upper[self._pins] = np.inf if soft else 0.0
+        self.program.q[self._slack] = self._problem.slack_weight if soft else 0.0
+
+    def write_step(self, x0: FloatArray, x_ref: FloatArray) -> None:
+        """Write the state x0 (nx,) and the reference x_ref (N+1, nx) of a control step."""
+        problem = self._problem
+        self._x0 = x0
+        rhs = problem.model.A @ x0
+        first = slice(self._dynamics.start, self._dynamics.start + problem.model.nx)
+        self.program.lower[first] = self.program.upper[first] = rhs
+        gradient = -2 * x_ref[1:] @ problem.Q
+        gradient[-1] = -2 * problem.Qf @ x_ref[-1]
+        self.program.q[self._x] = gradient.ravel()
+
+    def write_half_spaces(self, spaces: HalfSpaces) -> None:
+        """Write normals, slopes and offsets into the rows of the half-spaces."""
+        data = self.program.A.data
+        data[self._places["normals"]] = spaces.normal.ravel()
+        data[self._places["slopes"]] = spaces.slope.ravel()
+        self.program.lower[self._spaces] = spaces.offset.ravel()
+
+    def pack(self, iterate: Iterate) -> tuple[FloatArray, FloatArray]:
+        """Flatten an iterate into z and y; missing multipliers are zero."""
+        z = np.concatenate(
+            [iterate.states[1:].ravel(), iterate.inputs.ravel(), iterate.s, iterate.slack.ravel()]
+        )
+        y = np.zeros(len(self.program.lower))
+        if iterate.multipliers is not None:
+            duals = iterate.multipliers
+            y[self._dynamics] = duals.dynamics.ravel()
+            y[self._inputs] = duals.inputs.ravel()
+            y[self._margin] = duals.margin
+            y[self._spaces] = duals.obstacles.ravel()
+            y[self._pins] = duals.slack.ravel()
+        return z, y
+
+    def unpack(self, z: FloatArray, y: FloatArray) -> Iterate:
+        """Name the parts of z and y; inputs and sizes are clipped to their bounds."""
+        problem = self._problem
+        N, M, model = problem.horizon, problem.max_obstacles, problem.model
+        return Iterate(
+            np.concatenate([self._x0[None], z[self._x].reshape(N, model.nx)]),
+            np.clip(z[self._u].reshape(N, model.nu), problem.u_min, problem.u_max),
+            np.clip(z[self._s], problem.margin.lower, problem.margin.upper),
+            np.maximum(z[self._slack].reshape(M, N), 0.0),
+            Multipliers(
+                y[self._dynamics].reshape(N, model.nx),
+                y[self._inputs].reshape(N, model.nu),
+                y[self._margin],
+                y[self._spaces].reshape(M, N),
+                y[self._pins].reshape(M, N),
+            ),
+        )
+
+    def residuals(self, iterate: Iterate) -> KKTResiduals:
+        """KKT residuals of the program as it stands at an iterate and its multipliers."""
+        return self.program.residuals(*self.pack(iterate))
+
+    def resting(self, states: FloatArray) -> Iterate:
+        """An iterate with the given states (N+1, nx), no input, s = s_ref and no slack."""
+        problem = self._problem
+        N, M = problem.horizon, problem.max_obstacles
+        s = np.full(M, problem.margin.reference)
+        return Iterate(states, np.zeros((N, problem.model.nu)), s, np.zeros((M, N)))
+
+    def _hessian(self) -> sparse.csc_matrix:
+        problem = self._problem
+        N, M = problem.horizon, problem.max_obstacles
+        blocks = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
+        blocks += [problem.margin.weight * np.eye(M), np.zeros((M * N, M * N))]
+        return sparse.csc_matrix(2 * sparse.block_diag(blocks, format="csc"))
+
+    def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict]:
+        problem = self._problem
+        model, N, M, d = problem.model, problem.horizon, problem.max_obstacles, problem.model.dim
+        i = np.arange(N)[:, None, None]
+        row = self._dynamics.start + i * model.nx + np.arange(model.nx)[:, None]
+        state = self._x.start + i * model.nx + np.arange(model.nx)
+        control = self._u.start + i * model.nu + np.arange(model.nu)
+        blocks = SparseBlocks()
+        diagonal = np.arange(N * model.nx)
+        blocks.add("next", self._dynamics.start + diagonal, self._x.start + diagonal, 1.0)
+        blocks.add("A", row[1:], state[:-1], -model.A)
+        blocks.add("B", row, control, -model.B)
+        for name, rows, columns in (
+            ("inputs", self._inputs, self._u),
+            ("margin", self._margin, self._s),
+            ("pins", self._pins, self._slack),
+            ("slack", self._spaces, self._slack),
+        ):
+            blocks.add(name, np.arange(rows.start, rows.stop), _range(columns), 1.0)
+        space = self._spaces.start + np.arange(M * N).reshape(M, N, 1)
+        position = self._x.start + np.arange(N)[:, None] * model.nx + model.position
+        blocks.add("normals", space, np.broadcast_to(position, (M, N, d)), 0.0)
+        blocks.add("slopes", space[..., 0], self._s.start + np.arange(M)[:, None], 0.0)
+        return blocks.build(shape)
+
+
+def _slices(sizes: tuple[int, ...]) -> list[slice]:
+    stops = np.cumsum(sizes).tolist()
+    return [slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)]
+
+
+def _range(part: slice) -> np.ndarray:
+    return np.arange(part.start, part.stop)

@@ -1,0 +1,58 @@
+"""A quadratic program's solution that can be trusted: OSQP, checked, else the rescue solver."""
+
+from collections import Counter
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.settings import QPSettings
+from scp_mpc.solver.program import QuadraticProgram
+from scp_mpc.solver.qp import OSQPSolver, QPSolution
+from scp_mpc.solver.rescue import RescueSolver
+
+
+class TrustedSolver:
+    """Returns only points whose KKT residual, recomputed from the program's data, is small.
+
+    Attributes:
+        finished: How many programs each solver finished since `reset_counts`.
+        seconds: Time spent in the solvers since `reset_counts`.
+    """
+
+    def __init__(self, program: QuadraticProgram, settings: QPSettings) -> None:
+        """Set up OSQP for the pattern of `program`, whose values are read at each solve."""
+        self._program = program
+        self._accuracy = settings.accuracy
+        self._osqp = OSQPSolver(program, settings)
+        self._rescue = None
+        if settings.rescue is not None:
+            rescue = RescueSolver(settings)
+            self._rescue = lambda: rescue.solve(program)
+        self.finished: Counter[str] = Counter()
+        self.seconds = 0.0
+
+    def solve(self, x: FloatArray, y: FloatArray) -> QPSolution | None:
+        """Solve the program as it stands, warm-started at x and y; None if nobody could."""
+        program = self._program
+        self._osqp.update(program.q, program.A.data, program.lower, program.upper)
+        for attempt in (lambda: self._osqp.solve(x, y), self._rescue):
+            if attempt is None:
+                break
+            solution = attempt()
+            self.seconds += solution.seconds
+            if self._accepts(solution):
+                self.finished[solution.solver] += 1
+                return solution
+        return None
+
+    def reset(self) -> None:
+        """Forget everything that earlier programs left behind."""
+        self._osqp.reset()
+
+    def reset_counts(self) -> None:
+        """Start counting programs and seconds anew."""
+        self.finished = Counter()
+        self.seconds = 0.0
+
+    def _accepts(self, solution: QPSolution) -> bool:
+        if not solution.has_point:
+            return False
+        return self._program.residuals(solution.x, solution.y).worst <= self._accuracy
