@@ -17,15 +17,15 @@ class QPSettings:
         max_iterations: OSQP's iterations before the rescue solver is asked.
         check_interval: Iterations between OSQP's checks for termination.
         rho: OSQP's initial step size.
-        rescue: Name of the rescue solver, any sparse one that qpsolvers knows; None for none.
+        rescue: Whether to ask PIQP for what OSQP does not bring to `accuracy`.
     """
 
     accuracy: float = 1e-7
     eps: float = 1e-4
-    max_iterations: int = 300
+    max_iterations: int = 150
     check_interval: int = 10
     rho: float = 0.1
-    rescue: str | None = "piqp"
+    rescue: bool = True
 
     def __post_init__(self) -> None:
         """Check every number, because OSQP does not."""

@@ -59,7 +59,7 @@ class MPC:
         challenge = self._steps_touching % self.settings.sides_interval == 0
         plan = self._solver.solve(x0, x_ref, obstacles, self.nominal(), challenge)
         self._last = plan.iterate
-        self._steps_touching = self._steps_touching + 1 if plan.touches else 0
+        self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
         return plan
 
     def reset(self) -> None:

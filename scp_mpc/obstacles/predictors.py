@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -90,7 +91,7 @@ class ConstantVelocityPredictor:
         )
 
 
-def _turned(velocity: FloatArray, angles: FloatArray) -> FloatArray:
+def _turned(velocity: FloatArray, angles: NDArray[np.floating]) -> FloatArray:
     """Rotate one planar velocity by each of the angles, (n, 2)."""
     c, s = np.cos(angles), np.sin(angles)
     return np.stack([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]], axis=-1)

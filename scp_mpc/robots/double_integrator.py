@@ -23,10 +23,10 @@ class DoubleIntegrator(LinearModel):
         if dim not in (2, 3):
             raise InvalidArgumentError("dim", f"{dim} is neither 2 nor 3")
         dt = as_number("dt", dt)
-        axes = np.eye(dim)
+        axes: FloatArray = np.eye(dim)
         super().__init__(
-            A=np.kron(axes, [[1.0, dt], [0.0, 1.0]]),
-            B=np.kron(axes, [[dt**2 / 2], [dt]]),
+            A=np.kron(axes, np.array([[1.0, dt], [0.0, 1.0]])),
+            B=np.kron(axes, np.array([[dt**2 / 2], [dt]])),
             dt=dt,
             position=np.arange(0, 2 * dim, 2),
         )

@@ -55,7 +55,7 @@ class ClosedLoop:
     @property
     def times(self) -> FloatArray:
         """(K+1,) [s]."""
-        return DT * np.arange(self.steps + 1)
+        return DT * np.arange(self.steps + 1, dtype=np.float64)
 
     @property
     def positions(self) -> FloatArray:

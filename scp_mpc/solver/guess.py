@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from scp_mpc.arrays import require_finite
 from scp_mpc.errors import InvalidArgumentError, ShapeError
 from scp_mpc.problem import Problem
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.trajectory import Trajectory
 
 
@@ -14,23 +15,25 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
     Raises:
         InvalidArgumentError: The guess is neither a trajectory nor an iterate.
         ShapeError: Its horizon or sizes are not those of the problem.
+        NotFiniteError: NaN or infinity.
     """
     model, N, M = problem.model, problem.horizon, problem.max_obstacles
     if not isinstance(guess, Trajectory | Iterate):
         raise InvalidArgumentError("guess", f"{guess!r} is neither a Trajectory nor an Iterate")
-    for name, array, shape in (
-        ("guess.states", guess.states, (N + 1, model.nx)),
-        ("guess.inputs", guess.inputs, (N, model.nu)),
-    ):
-        if array.shape != shape:
-            raise ShapeError(name, f"shape {array.shape} is not {shape}")
     if isinstance(guess, Trajectory):
         s = np.full(M, problem.margin.reference)
-        return Iterate(guess.states, guess.inputs, s, np.zeros((M, N)))
-    for name, array, shape in (
-        ("guess.s", guess.s, (M,)),
-        ("guess.slack", guess.slack, (M, N)),
-    ):
-        if array.shape != shape:
-            raise ShapeError(name, f"shape {array.shape} is not {shape}")
+        guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N)))
+    path = {"states": (N + 1, model.nx), "inputs": (N, model.nu)}
+    _check(guess, {**path, "s": (M,), "slack": (M, N)})
+    if guess.multipliers is not None:
+        shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}
+        _check(guess.multipliers, {**shapes, "obstacles": (M, N), "slack": (M, N)})
     return guess
+
+
+def _check(owner: Iterate | Multipliers, shapes: dict[str, tuple[int, ...]]) -> None:
+    for name, shape in shapes.items():
+        array = getattr(owner, name)
+        if array.shape != shape:
+            raise ShapeError(f"guess.{name}", f"shape {array.shape} is not {shape}")
+        require_finite(f"guess.{name}", array)

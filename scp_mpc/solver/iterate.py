@@ -52,6 +52,11 @@ class Iterate:
     slack: FloatArray
     multipliers: Multipliers | None = None
 
+    @property
+    def touches(self) -> bool:
+        """Whether an obstacle may shape this point: an active constraint, or no multipliers."""
+        return self.multipliers is None or bool(self.multipliers.obstacles.any())
+
     def shifted(self, model: LinearModel) -> "Iterate":
         """Return the iterate one step later: the last input is held, its end state appended."""
         last = model.step(self.states[-1], self.inputs[-1])

@@ -17,6 +17,11 @@ class Status(Enum):
     VIOLATING = "Iterations ran out and the plan still enters a no-go set."
     FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
 
+    @property
+    def ok(self) -> bool:
+        """Whether every constraint of the problem holds."""
+        return self in (Status.CONVERGED, Status.FEASIBLE)
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -69,16 +74,9 @@ class Plan:
     @property
     def ok(self) -> bool:
         """Whether every constraint holds, so that the plan is safe to follow."""
-        return self.status in (Status.CONVERGED, Status.FEASIBLE)
+        return self.status.ok
 
     @property
-    def touches(self) -> bool:
-        """Whether an obstacle shapes the plan: an active constraint, slack, or no certificate."""
-        duals = self.iterate.multipliers
-        return not self.ok or duals is None or bool(duals.obstacles.any())
-
-    @property
-    def multipliers(self) -> Multipliers:
-        """Multipliers of the constraints, padded to all obstacle slots."""
-        assert self.iterate.multipliers is not None
+    def multipliers(self) -> Multipliers | None:
+        """Multipliers of the constraints, padded to all obstacle slots; None after a fallback."""
         return self.iterate.multipliers

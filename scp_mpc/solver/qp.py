@@ -67,14 +67,24 @@ class OSQPSolver:
         A = sparse.block_diag([program.A, anchor], format="csc")
         if A.nnz != self._nnz + 1:
             raise ShapeError("A", f"{self._nnz} stored entries became {A.nnz - 1}")
-        P = sparse.block_diag([sparse.triu(program.P), sparse.csc_matrix((1, 1))], format="csc")
+        self._first = {
+            "P": sparse.block_diag([sparse.triu(program.P), 0 * anchor], format="csc"),
+            "q": np.append(program.q, -1.0),
+            "A": A,
+            "l": np.append(np.maximum(program.lower, -_INFINITY), 1.0),
+            "u": np.append(np.minimum(program.upper, _INFINITY), 1.0),
+        }
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the state after construction, bit for bit; call `update` next.
+
+        Only a new set-up does: OSQP rescales its copies of P and A in place at every update.
+        """
+        settings = self._settings
         self._solver = osqp.OSQP(algebra="builtin")
         self._solver.setup(
-            P=P,
-            q=np.append(program.q, -1.0),
-            A=A,
-            l=np.append(np.maximum(program.lower, -_INFINITY), 1.0),
-            u=np.append(np.minimum(program.upper, _INFINITY), 1.0),
+            **{name: value.copy() for name, value in self._first.items()},
             verbose=False,
             polishing=True,
             rho=settings.rho,
@@ -124,7 +134,7 @@ class OSQPSolver:
         finite = np.isfinite(solution.x).all() and np.isfinite(solution.y).all()
         if solution.has_point and finite:
             return solution
-        self.reset()
+        self._forget()
         nothing = np.full(self._n, np.nan), np.full(self._m, np.nan)
         status = QPStatus.FAILED if solution.has_point else status
         return QPSolution(*nothing, status, solution.iterations, seconds, "osqp")
@@ -141,8 +151,8 @@ class OSQPSolver:
         _check(y, "y", self._m)
         self._solver.warm_start(x=np.append(x, 1.0), y=np.append(y, 1.0))
 
-    def reset(self) -> None:
-        """Forget the iterates and the adapted step size: the next solve is as the first."""
+    def _forget(self) -> None:
+        """Drop the iterates and the adapted step size, which a failed solve may have spoilt."""
         self._solver.update_settings(rho=self._settings.rho)
         self._solver.warm_start(x=np.zeros(self._n + 1), y=np.zeros(self._m + 1))
 

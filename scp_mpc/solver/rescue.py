@@ -1,67 +1,107 @@
 """The rescue: an interior-point solver for the few programs that OSQP does not finish.
 
 Active-set changes cost ADMM hundreds to thousands of iterations; an interior-point method needs
-ten, whatever changed. It starts cold and goes through `qpsolvers`, which sets it up afresh.
+ten, whatever changed. PIQP (Schwan, Jiang, Kuhn and Jones, 2023) is kept set up for the pattern.
+
+Notation:
+    A_e x = b               rows with equal bounds
+    l <= A_i x <= u         rows with a finite bound; those without any are left out
 """
 
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-import qpsolvers
+import piqp
 from scipy import sparse
 
-from scp_mpc.errors import InvalidArgumentError
-from scp_mpc.settings import QPSettings
+from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.solver.program import QuadraticProgram
 from scp_mpc.solver.qp import QPSolution, QPStatus
 
 _PRECISION = 1e-12
-_OPTIONS: dict[str, dict[str, float]] = {
-    "piqp": dict.fromkeys(
-        ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"), _PRECISION
-    ),
-    "clarabel": dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), _PRECISION),
-}
+_INFINITY = 1e30  # PIQP's own
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Some rows of A as a matrix of their own, with the places of its values in A's."""
+
+    indices: IntArray
+    matrix: sparse.csc_matrix
+    places: IntArray
+
+    @classmethod
+    def of(cls, A: sparse.csc_matrix, indices: IntArray) -> "_Rows":
+        numbered = sparse.csc_matrix((np.arange(A.nnz), A.indices, A.indptr), shape=A.shape)
+        part = numbered[indices]
+        places = part.data.astype(np.intp)
+        matrix = sparse.csc_matrix((A.data[places], part.indices, part.indptr), part.shape)
+        return cls(indices, matrix, places)
+
+    def read(self, data: FloatArray) -> sparse.csc_matrix:
+        self.matrix.data[:] = data[self.places]
+        return self.matrix
 
 
 class RescueSolver:
-    """Solves a program from scratch with another solver and translates its multipliers.
+    """PIQP, set up once for each division of the rows; later only values change."""
 
-    Raises:
-        InvalidArgumentError: The solver is unknown or not installed.
-    """
+    def __init__(self, program: QuadraticProgram) -> None:
+        """Remember the program, whose values are read at each solve."""
+        self._program = program
+        self._known: dict[bytes, tuple[piqp.SparseSolver, _Rows, _Rows]] = {}
 
-    def __init__(self, settings: QPSettings) -> None:
-        """Check at construction that the solver is there, not in the middle of a drive."""
-        name = settings.rescue
-        if name not in _OPTIONS or name not in qpsolvers.sparse_solvers:
-            there = ", ".join(s for s in _OPTIONS if s in qpsolvers.sparse_solvers)
-            raise InvalidArgumentError("qp.rescue", f"{name!r} is none of the installed: {there}")
-        self._name = name
-
-    def solve(self, program: QuadraticProgram) -> QPSolution:
-        """Solve `program`; rows with equal bounds become equations, infinite bounds vanish."""
+    def solve(self) -> QPSolution:
+        """Solve the program as it stands, from a cold start."""
         began = perf_counter()
-        rows = program.A.tocsr()
-        equal = program.lower == program.upper
-        above = np.flatnonzero(~equal & np.isfinite(program.upper))
-        below = np.flatnonzero(~equal & np.isfinite(program.lower))
-        equal = np.flatnonzero(equal)
-        problem = qpsolvers.Problem(
-            program.P,
+        program = self._program
+        solver, equations, inequalities = self._set_up()
+        e, i = equations.indices, inequalities.indices
+        solver.update(
+            None,
             program.q,
-            sparse.vstack([rows[above], -rows[below]], format="csc"),
-            np.concatenate([program.upper[above], -program.lower[below]]),
-            rows[equal].tocsc(),
-            program.lower[equal],
+            equations.read(program.A.data),
+            program.lower[e],
+            inequalities.read(program.A.data),
+            np.maximum(program.lower[i], -_INFINITY),
+            np.minimum(program.upper[i], _INFINITY),
         )
-        found = qpsolvers.solve_problem(problem, self._name, **_OPTIONS[self._name])
+        status = _STATUS.get(solver.solve(), QPStatus.FAILED)
         x, y = np.full(len(program.q), np.nan), np.full(len(program.lower), np.nan)
-        status = QPStatus.FAILED
-        if found.found and found.x is not None and found.y is not None and found.z is not None:
-            status = QPStatus.SOLVED
-            x, y = np.array(found.x), np.zeros(len(program.lower))
-            y[equal] = found.y
-            y[above] += found.z[: len(above)]
-            y[below] -= found.z[len(above) :]
-        return QPSolution(x, y, status, 0, perf_counter() - began, self._name)
+        if status is QPStatus.SOLVED:
+            result = solver.result
+            x, y = np.array(result.x), np.zeros(len(program.lower))
+            y[e], y[i] = result.y, result.z_u - result.z_l
+        iterations = int(solver.result.info.iter)
+        return QPSolution(x, y, status, iterations, perf_counter() - began, "piqp")
+
+    def _set_up(self) -> tuple[piqp.SparseSolver, _Rows, _Rows]:
+        program = self._program
+        same = program.lower == program.upper
+        bounded = ~same & (np.isfinite(program.lower) | np.isfinite(program.upper))
+        key = same.tobytes() + bounded.tobytes()
+        if key not in self._known:
+            parts = [_Rows.of(program.A, np.flatnonzero(mask)) for mask in (same, bounded)]
+            solver = piqp.SparseSolver()
+            for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
+                setattr(solver.settings, name, _PRECISION)
+            solver.settings.verbose = False
+            zero = np.zeros(len(parts[1].indices))
+            solver.setup(
+                program.P,
+                program.q,
+                parts[0].matrix,
+                program.lower[parts[0].indices],
+                parts[1].matrix,
+                zero - 1,
+                zero + 1,
+            )
+            self._known[key] = solver, *parts
+        return self._known[key]
+
+
+_STATUS = {
+    piqp.PIQP_SOLVED: QPStatus.SOLVED,
+    piqp.PIQP_PRIMAL_INFEASIBLE: QPStatus.INFEASIBLE,
+}

@@ -47,17 +47,6 @@ class Descent:
     status: Status
     iterations: int
 
-    @property
-    def ok(self) -> bool:
-        """Whether every constraint holds."""
-        return self.status in (Status.CONVERGED, Status.FEASIBLE)
-
-    @property
-    def touches(self) -> bool:
-        """Whether an obstacle's constraint shapes the plan."""
-        duals = self.iterate.multipliers
-        return not self.ok or duals is None or bool(duals.obstacles.any())
-
 
 class SCP:
     """Solves one control step at a time, without memory of the last plan.
@@ -106,7 +95,7 @@ class SCP:
         nominal = nominal or self._free_plan(step)
         best = self._descend(step, nominal, self.settings.max_iterations)
         tried, switched = 0, False
-        if challenge and self.settings.sides and best.touches:
+        if challenge and self.settings.sides and best.iterate.touches:
             best, tried, switched = self._challenge(step, best)
         return self._plan(step, best, tried, switched, began)
 
@@ -115,16 +104,16 @@ class SCP:
         iterate, residuals, iterations = nominal, KKTResiduals(np.inf, np.inf, np.inf), 0
         self._subproblem.soft = bool(nominal.slack.max(initial=0.0) > self.settings.tolerance)
         self._linearise_about(step, nominal)
-        while residuals.worst > self.settings.tolerance:
-            if iterations == limit:
-                break
+        while residuals.worst > self.settings.tolerance and iterations < limit:
             convex = self._solve_convex(iterate)
             if convex is None:
-                return self._given_up(step, nominal, residuals, iterations)
+                break
             iterate = convex
             self._linearise_about(step, iterate)
             residuals = self._subproblem.residuals(iterate)
             iterations += 1
+        if iterations == 0:
+            return self._given_up(step, nominal)
         status = self._judge(residuals, iterate)
         return Descent(iterate, self._cost(step, iterate), residuals, status, iterations)
 
@@ -132,7 +121,7 @@ class SCP:
         """Try the other sides, if there is something to win."""
         free = self._free_plan(step)
         most = best.cost - self._cost(step, free)  # no plan costs less than the free one
-        if best.ok and most <= _HYSTERESIS * best.cost:
+        if best.status.ok and most <= _HYSTERESIS * best.cost:
             return best, 0, False
         position = self.problem.model.position
         value = step.half_spaces(self.problem, free.states, free.s).value
@@ -140,7 +129,8 @@ class SCP:
         incumbent = best
         for start in starts:
             rival = self._descend(step, start, _EXPLORATION)
-            if rival.ok and (not best.ok or rival.cost < best.cost - _HYSTERESIS * most):
+            ahead = not best.status.ok or rival.cost < best.cost - _HYSTERESIS * most
+            if rival.status.ok and ahead:
                 best = rival
         if best is not incumbent and best.status is Status.FEASIBLE:
             best = self._descend(step, best.iterate, self.settings.max_iterations)
@@ -180,9 +170,7 @@ class SCP:
             return Status.SOFTENED if inside else Status.CONVERGED
         return Status.VIOLATING if inside else Status.FEASIBLE
 
-    def _given_up(
-        self, step: StepData, nominal: Iterate, residuals: KKTResiduals, iterations: int
-    ) -> Descent:
+    def _given_up(self, step: StepData, nominal: Iterate) -> Descent:
         """Keep the nominal inputs, roll them out from x0, and own up to what they violate."""
         problem = self.problem
         inputs = np.clip(nominal.inputs, problem.u_min, problem.u_max)
@@ -190,7 +178,8 @@ class SCP:
         s = np.full(problem.max_obstacles, problem.margin.reference)
         value = step.half_spaces(problem, path.states, s).value
         iterate = Iterate(path.states, inputs, s, np.maximum(0.0, -value))
-        return Descent(iterate, self._cost(step, iterate), residuals, Status.FALLBACK, iterations)
+        unknown = KKTResiduals(np.inf, np.inf, np.inf)
+        return Descent(iterate, self._cost(step, iterate), unknown, Status.FALLBACK, 0)
 
     def _cost(self, step: StepData, iterate: Iterate) -> float:
         return self.problem.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)

@@ -15,13 +15,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.solver.iterate import Iterate
 
 
 def candidates(
-    free: Iterate, positions: FloatArray, position: FloatArray, sets: NoGoSets, value: FloatArray
+    free: Iterate, positions: FloatArray, position: IntArray, sets: NoGoSets, value: FloatArray
 ) -> list[Iterate]:
     """Return starts that pass the first conflicting obstacle on its sides; none if none conflicts.
 
@@ -44,7 +44,7 @@ def candidates(
     ]
 
 
-def _sides(positions: FloatArray, means: FloatArray, stages: FloatArray) -> list[FloatArray]:
+def _sides(positions: FloatArray, means: FloatArray, stages: IntArray) -> list[FloatArray]:
     relative = positions[1:] - means
     begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(means) - 1)
     v = relative[end] - relative[begin]
@@ -56,7 +56,7 @@ def _sides(positions: FloatArray, means: FloatArray, stages: FloatArray) -> list
 
 
 def _boundary_points(
-    sets: NoGoSets, s: FloatArray, j: int, stages: FloatArray, n: FloatArray
+    sets: NoGoSets, s: FloatArray, j: int, stages: IntArray, n: FloatArray
 ) -> FloatArray:
     """Points of the no-go sets' boundary with outward normal n: mu + s Sigma n / |.| + r n."""
     rotation, deviation = sets.rotations[j, stages], sets.deviations[j, stages]
@@ -67,7 +67,7 @@ def _boundary_points(
     return sets.means[j, stages] + ellipsoid + sets.radii[j] * n
 
 
-def _moved(free: Iterate, position: FloatArray, stages: FloatArray, points: FloatArray) -> Iterate:
+def _moved(free: Iterate, position: IntArray, stages: IntArray, points: FloatArray) -> Iterate:
     states = free.states.copy()
     states[np.ix_(stages + 1, position)] = points
     return replace(free, states=states)

@@ -14,7 +14,7 @@ OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
 import numpy as np
 from scipy import sparse
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.solver.iterate import Iterate, Multipliers
@@ -35,12 +35,11 @@ class Subproblem:
         """Lay out variables and rows and write the constant values."""
         self._problem = problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        sizes = (N * model.nx, N * model.nu, M, M * N)
-        self._x, self._u, self._s, self._slack = _slices(sizes)
-        n = sum(sizes)
-        sizes = (N * model.nx, N * model.nu, M, M * N, M * N)
-        self._dynamics, self._inputs, self._margin, self._spaces, self._pins = _slices(sizes)
-        m = sum(sizes)
+        columns = [N * model.nx, N * model.nu, M, M * N]
+        rows = [N * model.nx, N * model.nu, M, M * N, M * N]
+        self._x, self._u, self._s, self._slack = _slices(columns)
+        self._dynamics, self._inputs, self._margin, self._spaces, self._pins = _slices(rows)
+        n, m = sum(columns), sum(rows)
         A, self._places = self._constraints((m, n))
         self.program = QuadraticProgram(
             self._hessian(), np.zeros(n), A, np.full(m, -np.inf), np.full(m, np.inf)
@@ -135,7 +134,7 @@ class Subproblem:
         blocks += [problem.margin.weight * np.eye(M), np.zeros((M * N, M * N))]
         return sparse.csc_matrix(2 * sparse.block_diag(blocks, format="csc"))
 
-    def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict]:
+    def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict[str, IntArray]]:
         problem = self._problem
         model, N, M, d = problem.model, problem.horizon, problem.max_obstacles, problem.model.dim
         i = np.arange(N)[:, None, None]
@@ -161,10 +160,10 @@ class Subproblem:
         return blocks.build(shape)
 
 
-def _slices(sizes: tuple[int, ...]) -> list[slice]:
+def _slices(sizes: list[int]) -> list[slice]:
     stops = np.cumsum(sizes).tolist()
     return [slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)]
 
 
-def _range(part: slice) -> np.ndarray:
+def _range(part: slice) -> IntArray:
     return np.arange(part.start, part.stop)

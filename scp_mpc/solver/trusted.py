@@ -1,6 +1,7 @@
 """A quadratic program's solution that can be trusted: OSQP, checked, else the rescue solver."""
 
 from collections import Counter
+from collections.abc import Iterator
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.settings import QPSettings
@@ -22,10 +23,7 @@ class TrustedSolver:
         self._program = program
         self._accuracy = settings.accuracy
         self._osqp = OSQPSolver(program, settings)
-        self._rescue = None
-        if settings.rescue is not None:
-            rescue = RescueSolver(settings)
-            self._rescue = lambda: rescue.solve(program)
+        self._rescue = None if not settings.rescue else RescueSolver(program)
         self.finished: Counter[str] = Counter()
         self.seconds = 0.0
 
@@ -33,10 +31,7 @@ class TrustedSolver:
         """Solve the program as it stands, warm-started at x and y; None if nobody could."""
         program = self._program
         self._osqp.update(program.q, program.A.data, program.lower, program.upper)
-        for attempt in (lambda: self._osqp.solve(x, y), self._rescue):
-            if attempt is None:
-                break
-            solution = attempt()
+        for solution in self._attempts(x, y):
             self.seconds += solution.seconds
             if self._accepts(solution):
                 self.finished[solution.solver] += 1
@@ -51,6 +46,11 @@ class TrustedSolver:
         """Start counting programs and seconds anew."""
         self.finished = Counter()
         self.seconds = 0.0
+
+    def _attempts(self, x: FloatArray, y: FloatArray) -> Iterator[QPSolution]:
+        yield self._osqp.solve(x, y)
+        if self._rescue is not None:
+            yield self._rescue.solve()
 
     def _accepts(self, solution: QPSolution) -> bool:
         if not solution.has_point:

@@ -1,0 +1,150 @@
+"""How long one control step takes at the report's two horizons, solver by solver.
+
+For N = 8 and N = 30 (scenarios 2 and 1) a closed-loop run is recorded once. Every solver then
+solves its steps from the same guess, in turn, so that the noise of the machine hits all alike:
+
+    scp_mpc                 from the guess, on the side of the guess: like for like
+    scp_mpc (both sides)    default settings, trying the other sides at every step
+    ipopt, slsqp            see their modules
+
+Only scp_mpc uses the multipliers of the guess; the peers have no use for them.
+"""
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from scp_mpc.comparison.attempts import Attempts, rows
+from scp_mpc.comparison.ipopt import Ipopt
+from scp_mpc.comparison.ours import Ours
+from scp_mpc.comparison.peer_plan import Peer, PeerMissingError
+from scp_mpc.comparison.provenance import provenance
+from scp_mpc.comparison.sequence import RecordedStep, record
+from scp_mpc.comparison.slsqp import Slsqp
+from scp_mpc.comparison.timing_figure import timing_figure
+from scp_mpc.comparison.timing_table import timing_table
+from scp_mpc.problem import Problem
+from scp_mpc.settings import require_count
+from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
+
+NAME = "horizon_timing"  # of the files
+SLOW_STEPS = 20
+_SCENARIOS = ("scenario-2", "scenario-1")
+_SHORT = 10  # horizon up to which SLSQP is quick enough for every step
+
+_log = logging.getLogger(__name__)
+
+
+def measure(
+    scenario: Scenario,
+    steps: int,
+    seed: int = 0,
+    slow_steps: int = SLOW_STEPS,
+    advance: Callable[[], object] = lambda: None,
+) -> list[Attempts]:
+    """Record a scenario and let every solver solve its steps.
+
+    Args:
+        scenario: Whose problem, with the report's inflation.
+        steps: Number of control steps.
+        seed: Seed of the disturbance.
+        slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: this many at most.
+        advance: Called twice per step, when it is recorded and when it is solved by all.
+    """
+    require_count("steps", steps)
+    require_count("slow_steps", slow_steps)
+    problem = scenario.problem()
+    sequence = record(scenario, steps, seed, problem, advance=advance)
+    peers = _peers(problem)
+    every = dict.fromkeys(peers, 1)
+    if problem.horizon > _SHORT:
+        every["slsqp"] = -(-steps // slow_steps)
+    obstacles = len(sequence[0].obstacles)
+    contest = [
+        Attempts(name, problem.horizon, obstacles, len(range(0, steps, every[name])), {})
+        for name in peers
+    ]
+    for peer in peers.values():
+        _warm_up(peer, sequence[0])
+    for k, step in enumerate(sequence):
+        for attempts, peer in zip(contest, peers.values(), strict=True):
+            if peer is not None and k % every[attempts.solver] == 0:
+                attempts.plans[k] = peer.solve(step.x0, step.x_ref, step.obstacles, step.guess)
+        advance()
+    return contest
+
+
+def main(
+    json_path: Path | None,
+    out: Path | None,
+    steps: int,
+    seed: int,
+    slow_steps: int = SLOW_STEPS,
+    echo: Callable[[str], None] = _log.info,
+) -> None:
+    """Run the benchmark, echo its table and write its files.
+
+    Args:
+        json_path: File for {"rows": [...], "provenance": {...}}; None for no such file.
+        out: Folder for the table and the figure; None for neither.
+        steps: Number of control steps per horizon.
+        seed: Seed of the disturbance.
+        slow_steps: See `measure`.
+        echo: Takes the Markdown table.
+    """
+    with _progress(2 * steps * len(_SCENARIOS)) as advance:
+        contests = [
+            measure(SCENARIOS[name], steps, seed, slow_steps, advance) for name in _SCENARIOS
+        ]
+    summary = [row for contest in contests for row in rows(contest)]
+    origin = provenance()
+    table = timing_table(summary, origin)
+    echo(table)
+    if json_path is not None:
+        json_path.parent.mkdir(parents=True, exist_ok=True)
+        content = json.dumps({"rows": summary, "provenance": origin}, indent=2)
+        json_path.write_text(content + "\n", encoding="utf-8")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{NAME}.md").write_text(table + "\n", encoding="utf-8")
+        timing_figure(contests).savefig(out / f"{NAME}.png", dpi=150)
+
+
+def _peers(problem: Problem) -> dict[str, Peer | None]:
+    """The solvers by name; None for one that is not installed, whose row is kept."""
+    ipopt: Peer | None = None
+    try:
+        ipopt = Ipopt(problem)
+    except PeerMissingError as error:
+        _log.warning("ipopt has no results: %s", error)
+    return {
+        "scp_mpc": Ours(problem),
+        "scp_mpc (both sides)": Ours(problem, challenge=True),
+        "ipopt": ipopt,
+        "slsqp": Slsqp(problem),
+    }
+
+
+def _warm_up(peer: Peer | None, step: RecordedStep) -> None:
+    if peer is not None:
+        peer.solve(step.x0, step.x_ref, step.obstacles, step.guess)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[], object]]:
+    """A progress bar on a terminal, if there is one and tqdm is installed."""
+    bar: Any = None
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        _log.debug("tqdm is not installed: no progress bar")
+    else:
+        bar = tqdm(total=total, unit="step", disable=None)
+    try:
+        yield (lambda: None) if bar is None else bar.update
+    finally:
+        if bar is not None:
+            bar.close()

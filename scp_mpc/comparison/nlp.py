@@ -1,0 +1,53 @@
+"""The order of the unknowns in the full-space nonlinear program that the peers solve.
+
+Notation:
+    z = [x_1 .. x_N, u_0 .. u_{N-1}, s_1 .. s_M]
+
+    minimise   cost(z)
+    subject to x_{i+1} - A x_i - B u_i = 0,  g_{j,i}(z) >= 0,  lower <= z <= upper
+
+For the report's "axes" g is the left side of (14) less 1, its square form as printed:
+|R'(p - mu) / (s sigma + r)|^2 - 1. For "exact" it is the signed distance of `scp_mpc.safety`,
+which each peer writes in the way that suits it.
+"""
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.problem import Problem
+from scp_mpc.solver.iterate import Iterate
+
+
+class Unknowns:
+    """Packs and unpacks z.
+
+    Args:
+        problem: Whose unknowns.
+
+    Attributes:
+        size: Length of z.
+        lower: (size,) lower bounds, minus infinity for states.
+        upper: (size,) upper bounds, infinity for states.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        """Lay out z and its bounds."""
+        N, nx, nu = problem.horizon, problem.model.nx, problem.model.nu
+        self._shapes = (N, nx), (N, nu)
+        self.ends = N * nx, N * (nx + nu)
+        free, sizes = np.full(N * nx, np.inf), np.ones(problem.max_obstacles)
+        margin = problem.margin
+        self.lower = np.concatenate([-free, np.tile(problem.u_min, N), margin.lower * sizes])
+        self.upper = np.concatenate([free, np.tile(problem.u_max, N), margin.upper * sizes])
+        self.size = len(self.lower)
+
+    def pack(self, guess: Iterate) -> FloatArray:
+        """Return z of a guess, moved into the bounds."""
+        z = np.concatenate([guess.states[1:].ravel(), guess.inputs.ravel(), guess.s])
+        return np.clip(z, self.lower, self.upper)
+
+    def unpack(self, z: FloatArray, x0: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return states (N+1, nx) with row 0 = x0, inputs (N, nu) and sizes (M,)."""
+        later, inputs, s = np.split(z, self.ends)
+        states = np.concatenate([x0[None], later.reshape(self._shapes[0])])
+        return states, inputs.reshape(self._shapes[1]), s

@@ -1,0 +1,57 @@
+"""Our own solver in the clothes of a peer."""
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.comparison.peer_plan import PeerPlan
+from scp_mpc.comparison.violation import largest_violation
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
+from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.scp import SCP
+from scp_mpc.trajectory import Trajectory
+
+
+class Ours:
+    """`SCP`, judged like the others.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+        challenge: Try the other sides too, at every step. Without it the solver keeps to the
+            side of its guess, as the peers do.
+    """
+
+    def __init__(
+        self, problem: Problem, settings: Settings | None = None, challenge: bool = False
+    ) -> None:
+        """Set up the solver."""
+        self._solver = SCP(problem, settings)
+        self._challenge = challenge
+
+    def solve(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        guess: Trajectory | Iterate,
+    ) -> PeerPlan:
+        """Plan from the state x0; arguments as for `SCP.solve`."""
+        began = perf_counter()
+        plan = self._solver.solve(x0, x_ref, obstacles, guess, self._challenge)
+        seconds = perf_counter() - began
+        problem, start = self._solver.problem, np.asarray(x0, dtype=np.float64)
+        return PeerPlan(
+            X=plan.X,
+            U=plan.U,
+            s=plan.s,
+            cost=plan.cost,
+            violation=largest_violation(problem, start, obstacles, plan.X, plan.U, plan.s),
+            seconds=seconds,
+            ok=plan.ok,
+            message=plan.status.value,
+        )

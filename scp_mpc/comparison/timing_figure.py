@@ -1,0 +1,50 @@
+"""The distribution of the time per control step, one panel per horizon."""
+
+from collections.abc import Sequence
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from scp_mpc.comparison.attempts import Attempts
+from scp_mpc.simulation.scenarios import DT
+
+# Okabe and Ito's colours, told apart by any eye; line styles help in print.
+_STYLES = {
+    "scp_mpc": ("#0072B2", "-"),
+    "scp_mpc (both sides)": ("#56B4E9", "-"),
+    "ipopt": ("#D55E00", "--"),
+    "slsqp": ("#009E73", "-."),
+}
+
+
+def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
+    """Draw the share of steps solved within a time, for one contest per horizon."""
+    figure = Figure(figsize=(5.2 * len(contests), 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(contests), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, contest in zip(panels, contests, strict=True):
+        for attempts in contest:
+            if attempts.plans:
+                colour, line = _STYLES[attempts.solver]
+                axes.ecdf(
+                    attempts.milliseconds,
+                    label=attempts.solver,
+                    color=colour,
+                    linestyle=line,
+                    linewidth=2.2,
+                )
+        axes.axvline(1e3 * DT, color="black", linewidth=1.2, linestyle=":")
+        axes.text(
+            1e3 * DT, 0.03, " sampling time", fontsize=11, rotation=90, ha="right", va="bottom"
+        )
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.set_title(f"N = {contest[0].horizon}", fontsize=14)
+        axes.set_xlabel("time per control step [ms]", fontsize=13)
+        axes.tick_params(labelsize=12)
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("share of steps", fontsize=13)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=12, frameon=False)
+    return figure

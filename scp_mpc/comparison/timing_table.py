@@ -1,0 +1,32 @@
+"""The benchmark's rows as a Markdown table that names machine and commit."""
+
+from collections.abc import Mapping, Sequence
+
+from scp_mpc.comparison.attempts import Row
+
+_HEAD = (
+    "| Solver | N | Obstacles | Steps | Median [ms] | p99 [ms] | Max [ms] "
+    "| Cost gap | Violation | Failures |\n"
+    "|:--|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
+)
+
+
+def timing_table(summary: Sequence[Row], origin: Mapping[str, str | int | None]) -> str:
+    """Return the table of all rows, with a line on where they were measured."""
+    versions = ", ".join(f"{name} {origin[name] or 'missing'}" for name in ("osqp", "casadi"))
+    source = (
+        f"Measured on {origin['machine']}, {origin['cores']} cores, Python {origin['python']}, "
+        f"{versions}, commit {origin['commit'] or 'unknown'}, {origin['date']}."
+    )
+    return "\n".join([_HEAD, *(_line(row) for row in summary), "", source])
+
+
+def _line(row: Row) -> str:
+    times = (_shown(row[key], ".2f") for key in ("median_ms", "p99_ms", "max_ms"))
+    errors = (_shown(row[key], ".1e") for key in ("max_cost_gap", "max_violation"))
+    who = (row["solver"], row["horizon"], row["obstacles"], row["steps"])
+    return "| " + " | ".join(map(str, (*who, *times, *errors, row["failures"]))) + " |"
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "n/a" if value is None else format(value, form)

@@ -1,0 +1,63 @@
+"""The referee: how far a plan is from meeting the original constraints, whoever made it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.problem import Problem
+from scp_mpc.safety.no_go import NoGoSets
+
+
+def largest_violation(
+    problem: Problem,
+    x0: FloatArray,
+    obstacles: Sequence[ObstaclePrediction],
+    states: FloatArray,
+    inputs: FloatArray,
+    s: FloatArray,
+) -> float:
+    """Return the largest violation of any constraint; 0 for none, infinity for NaN.
+
+    It is the largest, each in its own unit, of |x_0 - x0|, the defects |x_{i+1} - f(x_i, u_i)|,
+    what inputs and sizes exceed their bounds by, and the depth [m] inside a no-go set at the
+    plan's own s: -g of `scp_mpc.safety.inflation`.
+
+    Args:
+        problem: Whose constraints.
+        x0: (nx,) state now.
+        obstacles: M predictions.
+        states: (N+1, nx).
+        inputs: (N, nu).
+        s: (M,) sizes of the obstacles' ellipsoids.
+    """
+    model, margin = problem.model, problem.margin
+    reached = np.array([model.step(x, u) for x, u in zip(states[:-1], inputs, strict=True)])
+    amounts = [
+        np.abs(states[0] - x0),
+        np.abs(states[1:] - reached),
+        problem.u_min - inputs,
+        inputs - problem.u_max,
+        margin.lower - s,
+        s - margin.upper,
+    ]
+    if obstacles:
+        amounts.append(-_constraint(problem, obstacles, states[:, model.position], s))
+    worst = max(float(amount.max(initial=0.0)) for amount in amounts)
+    finite = all(np.isfinite(amount).all() for amount in amounts)
+    return worst if finite else np.inf
+
+
+def _constraint(
+    problem: Problem,
+    obstacles: Sequence[ObstaclePrediction],
+    positions: FloatArray,
+    s: FloatArray,
+) -> FloatArray:
+    """The constraint function g (M, N) at positions (N+1, d), row 0 now."""
+    sets = NoGoSets.from_predictions(
+        obstacles, problem.robot_radius, len(obstacles), problem.horizon, problem.model.dim
+    )
+    start = positions[0] - np.stack([o.means[0] for o in obstacles])
+    return problem.no_go.linearise(sets, positions[1:], s, start).value

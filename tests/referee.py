@@ -1,0 +1,170 @@
+"""An independent formulation of the problem in CasADi: the referee of the convergence tests.
+
+Nothing here comes from the package but the numbers of the problem. The signed distance of the
+`exact` inflation is lifted: outside means that some direction n(theta) has
+n'(p - mu) - s sqrt(n' Sigma n) >= r, so theta joins the variables.
+"""
+
+from dataclasses import dataclass
+
+import casadi
+import numpy as np
+
+from scp_mpc import ObstaclePrediction, Plan, Problem
+
+_TWO_PI = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What IPOPT found."""
+
+    cost: float
+    ok: bool
+
+
+class Referee:
+    """The firm problem with one planar obstacle, over w = [X_1..N | U | s | theta]."""
+
+    def __init__(self, problem: Problem, x0, x_ref, obstacle: ObstaclePrediction) -> None:
+        self.problem, self.obstacle = problem, obstacle
+        N, model, margin = problem.horizon, problem.model, problem.margin
+        X, U = casadi.SX.sym("X", model.nx, N), casadi.SX.sym("U", model.nu, N)
+        s, theta = casadi.SX.sym("s"), casadi.SX.sym("theta", N)
+        Q, R = casadi.DM(problem.Q), casadi.DM(problem.R)
+        cost = margin.weight * (s - margin.reference) ** 2
+        defects, outside = [], []
+        previous = casadi.DM(x0)
+        reach = problem.robot_radius + obstacle.radius
+        for i in range(N):
+            error = X[:, i] - casadi.DM(x_ref[i + 1])
+            cost += error.T @ Q @ error + U[:, i].T @ R @ U[:, i]
+            defects.append(X[:, i] - model.A @ previous - model.B @ U[:, i])
+            previous = X[:, i]
+            delta = casadi.vertcat(X[0, i], X[2, i]) - casadi.DM(obstacle.means[i + 1])
+            Sigma = obstacle.covariances[i + 1]
+            if problem.inflation == "axes":
+                variances, axes = np.linalg.eigh(Sigma)
+                y = casadi.DM(axes).T @ delta
+                semi = s * casadi.DM(np.sqrt(variances)) + reach
+                outside.append(casadi.sqrt(casadi.sumsqr(y / semi)) - 1)
+            else:
+                n = casadi.vertcat(casadi.cos(theta[i]), casadi.sin(theta[i]))
+                spread = casadi.sqrt(n.T @ casadi.DM(Sigma) @ n)
+                outside.append(n.T @ delta - s * spread - reach)
+        self.z = casadi.vertcat(casadi.vec(X), casadi.vec(U), s)
+        self.theta = theta
+        self.cost = cost
+        self.defects, self.outside = casadi.vertcat(*defects), casadi.vertcat(*outside)
+        self.size_x, self.size_u = N * model.nx, N * model.nu
+
+    def angles(self, positions: np.ndarray, s: float) -> np.ndarray:
+        """Angle of the outward normal at each position, by search on a grid and bisection."""
+        grid = np.linspace(0.0, _TWO_PI, 721)
+        angles = []
+        for p, mu, Sigma in zip(
+            positions, self.obstacle.means[1:], self.obstacle.covariances[1:], strict=True
+        ):
+
+            def distance(theta, p=p, mu=mu, Sigma=Sigma):
+                n = np.array([np.cos(theta), np.sin(theta)])
+                return n.T @ (p - mu) - s * np.sqrt(np.einsum("i...,ij,j...", n, Sigma, n))
+
+            centre, width = grid[np.argmax(distance(grid))], grid[1]
+            for _ in range(12):
+                local = centre + width * np.linspace(-1.0, 1.0, 41)
+                centre, width = local[np.argmax(distance(local))], width / 10
+            angles.append(_polished(centre, p - mu, Sigma, s))
+        return np.array(angles)
+
+    def kkt(self, plan: Plan) -> dict[str, float]:
+        """KKT residuals of the original problem at a plan and its multipliers."""
+        duals = plan.multipliers
+        assert duals is not None
+        theta = self.angles(plan.X[1:, [0, 2]], float(plan.s[0]))
+        y_defects = casadi.SX.sym("y_defects", self.defects.numel())
+        y_outside = casadi.SX.sym("y_outside", len(theta))
+        lagrangian = self.cost + y_defects.T @ self.defects + y_outside.T @ self.outside
+        evaluate = casadi.Function(
+            "kkt",
+            [self.z, self.theta, y_defects, y_outside],
+            [casadi.gradient(lagrangian, self.z), self.defects, self.outside],
+        )
+        scale = self._row_scale()
+        z = np.concatenate([plan.X[1:].ravel(), plan.U.ravel(), plan.s])
+        gradient, defects, outside = (
+            np.array(v).ravel()
+            for v in evaluate(z, theta, duals.dynamics.ravel(), duals.obstacles[0] * scale)
+        )
+        gradient[self.size_x : -1] += duals.inputs.ravel()
+        gradient[-1] += duals.margin[0]
+        problem, U = self.problem, plan.U
+        bounds = np.concatenate([(U - problem.u_max).ravel(), (problem.u_min - U).ravel()])
+        size = np.array([plan.s[0] - problem.margin.upper, problem.margin.lower - plan.s[0]])
+        at_bound = np.where(duals.inputs > 0, problem.u_max - U, U - problem.u_min)
+        at_size = np.where(
+            duals.margin > 0, problem.margin.upper - plan.s, plan.s - problem.margin.lower
+        )
+        return {
+            "stationarity": np.abs(gradient).max(),
+            "defect": np.abs(defects).max(),
+            "violation": max(bounds.max(), size.max(), (-outside).max()),
+            "sign": max(0.0, duals.obstacles.max()),
+            "complementarity": max(
+                np.abs(duals.obstacles[0] * scale * outside).max(),
+                np.abs(duals.inputs * at_bound).max(),
+                np.abs(duals.margin * at_size).max(),
+            ),
+        }
+
+    def solve(self, X, U, s: float, near: bool) -> Verdict:
+        """Run IPOPT from a plan; `near` keeps the barrier small so that it stays close by."""
+        problem, N = self.problem, self.problem.horizon
+        theta = self.angles(X[1:, [0, 2]], s)
+        w = casadi.vertcat(self.z, self.theta)
+        nlp = {"x": w, "f": self.cost, "g": casadi.vertcat(self.defects, self.outside)}
+        options = {
+            "print_time": False,
+            "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 2000},
+        }
+        if near:
+            options["ipopt"] |= {
+                "mu_init": 1e-9,
+                "bound_push": 1e-10,
+                "bound_frac": 1e-10,
+                "slack_bound_push": 1e-10,
+                "slack_bound_frac": 1e-10,
+            }
+        free = np.full(self.size_x, np.inf)
+        result = (solver := casadi.nlpsol("referee", "ipopt", nlp, options))(
+            x0=np.concatenate([X[1:].ravel(), U.ravel(), [s], theta]),
+            lbx=np.concatenate(
+                [-free, np.tile(problem.u_min, N), [problem.margin.lower], np.full(N, -np.inf)]
+            ),
+            ubx=np.concatenate(
+                [free, np.tile(problem.u_max, N), [problem.margin.upper], np.full(N, np.inf)]
+            ),
+            lbg=np.zeros(self.size_x + N),
+            ubg=np.concatenate([np.zeros(self.size_x), np.full(N, np.inf)]),
+        )
+        return Verdict(float(result["f"]), bool(solver.stats()["success"]))
+
+    def _row_scale(self) -> np.ndarray:
+        """The package measures the `axes` constraint in metres: times the short semi-axis."""
+        if self.problem.inflation == "exact":
+            return np.ones(self.problem.horizon)
+        deviations = np.sqrt(np.linalg.eigvalsh(self.obstacle.covariances[1:]))[:, 0]
+        reach = self.problem.robot_radius + self.obstacle.radius
+        return self.problem.margin.reference * deviations + reach
+
+
+def _polished(theta: float, delta: np.ndarray, Sigma: np.ndarray, s: float) -> float:
+    """Newton steps on the stationarity of the support function."""
+    for _ in range(4):
+        n = np.array([np.cos(theta), np.sin(theta)])
+        t = np.array([-n[1], n[0]])
+        h = np.sqrt(n @ Sigma @ n)
+        slope = t @ delta - s * (t @ Sigma @ n) / h
+        bend = -n @ delta - s * ((t @ Sigma @ t - n @ Sigma @ n) / h - (t @ Sigma @ n) ** 2 / h**3)
+        theta -= slope / bend
+    return theta
