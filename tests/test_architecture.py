@@ -1,0 +1,128 @@
+"""The floors of the house: a file imports only from its own floor or lower ones."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "scp_mpc"
+FLOORS = [
+    {"errors", "arrays", "trajectory"},
+    {"robots", "obstacles", "settings"},
+    {"safety"},
+    {"problem"},
+    {"solver"},
+    {"control"},
+    {"simulation"},
+    {"comparison"},
+    {"report"},
+    {"cli", "__init__"},
+]
+FILES = sorted(PACKAGE.rglob("*.py"))
+ONLY_IN = {"osqp": "solver/qp.py", "piqp": "solver/rescue.py", "qpsolvers": "solver/oracle.py"}
+
+
+def name(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def room(module: str) -> str:
+    return module.split("/")[0].removesuffix(".py")
+
+
+def floor(which: str) -> int:
+    return next(i for i, rooms in enumerate(FLOORS) if which in rooms)
+
+
+def imports(path: Path) -> list[str]:
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found.append(node.module)
+    return found
+
+
+def within(path: Path) -> list[str]:
+    """Modules of the package that a file imports, as paths."""
+    found = []
+    for module in imports(path):
+        if module.split(".")[0] == "scp_mpc":
+            parts = module.split(".")[1:] or ["__init__"]
+            found.append("/".join(parts))
+    return found
+
+
+def test_every_room_has_a_floor():
+    assert {room(name(path)) for path in FILES} <= set().union(*FLOORS)
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_imports_only_from_its_own_floor_or_lower_ones(path):
+    mine = floor(room(name(path)))
+    for module in within(path):
+        assert floor(room(module)) <= mine, f"{name(path)} imports {module}"
+
+
+def test_no_import_goes_in_a_circle():
+    """Among files, a package's own __init__ aside."""
+    graph = {
+        name(path).removesuffix(".py"): set(within(path))
+        for path in FILES
+        if path.name != "__init__.py"
+    }
+    done: set[str] = set()
+
+    def visit(node, trail):
+        assert node not in trail, " -> ".join([*trail, node])
+        if node not in done and node in graph:
+            for child in graph[node]:
+                visit(child, [*trail, node])
+            done.add(node)
+
+    for node in graph:
+        visit(node, [])
+
+
+def test_solvers_are_imported_in_one_file_each():
+    for path in FILES:
+        for module in imports(path):
+            package = module.split(".")[0]
+            assert ONLY_IN.get(package, name(path)) == name(path), f"{name(path)}: {package}"
+
+
+def test_the_core_needs_no_extra():
+    """typer, rich and tqdm stay in the command line; casadi in the comparison."""
+    for path in FILES:
+        packages = {module.split(".")[0] for module in imports(path)}
+        if name(path) != "cli.py":
+            assert not packages & {"typer", "rich"}, name(path)
+        if room(name(path)) not in ("comparison", "cli"):
+            assert not packages & {"casadi", "tqdm"}, name(path)
+
+
+def test_one_noun_per_file():
+    lengths = {name(path): len(path.read_text().splitlines()) for path in FILES}
+    assert max(lengths.values()) <= 350, lengths
+    assert sorted(lengths.values())[len(lengths) // 2] <= 150
+    assert not [path for path in FILES if path.stem in ("utils", "helpers", "common", "misc")]
+
+
+def test_benchmarks_and_notebooks_use_public_names_only():
+    for path in (ROOT / "benchmarks").glob("*.py"):
+        for module in within(path):
+            assert "/_" not in module
+            assert module.count("/") <= 1, f"{path.name} reaches into {module}"
+
+
+def test_the_library_never_prints():
+    for path in FILES:
+        calls = [
+            node.func.id
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        ]
+        assert "print" not in calls, name(path)

@@ -1,0 +1,225 @@
+"""The sequential convex programming: optimal, feasible at every iterate, warm, and honest."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from instances import DT, KINDS, S_REF, instance, obstacle, problem, rotated, straight_reference
+
+from scp_mpc import (
+    SCP,
+    DoubleIntegrator,
+    ObstaclePrediction,
+    QPSettings,
+    Settings,
+    Status,
+    Trajectory,
+)
+from scp_mpc.solver import KKTResiduals
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.trusted import TrustedSolver
+
+KEEP_SIDE = Settings(sides=False)
+
+
+def test_no_obstacle_equals_the_riccati_solution():
+    N, model = 20, DoubleIntegrator(DT)
+    Q, R, Qf = np.diag([0.2, 0.05, 0.2, 0.05]), 0.01 * np.eye(2), np.diag([4.0, 1.0, 2.0, 1.0])
+    free = problem(N, R=[0.01, 0.01], Qf=Qf, u_min=-1e3, u_max=1e3)
+    x = np.array([1.0, -0.5, 0.3, 0.2])
+    plan = SCP(free).solve(x, np.zeros(4))
+    A, B, S = model.A, model.B, Qf
+    gains = []
+    for _ in range(N):
+        K = np.linalg.solve(R + B.T @ S @ B, B.T @ S @ A)
+        S = Q * (len(gains) < N - 1) + A.T @ S @ (A - B @ K)
+        gains.append(K)
+    cost = x @ S @ x
+    for i, K in enumerate(reversed(gains)):
+        np.testing.assert_allclose(plan.U[i], -K @ x, atol=1e-7)
+        x = A @ x - B @ K @ x
+        np.testing.assert_allclose(plan.X[i + 1], x, atol=1e-7)
+    assert plan.cost == pytest.approx(cost, rel=1e-9)
+    assert plan.status is Status.CONVERGED
+    assert plan.iterations == 1
+
+
+def test_a_step_without_active_obstacle_takes_one_program():
+    case = problem(20)
+    far = [obstacle(20, (0.0, 50.0))]
+    solver = SCP(case)
+    ref = straight_reference(20)
+    first = solver.solve(ref[0], ref, far)
+    second = solver.solve(ref[0], ref, far, first.iterate)
+    assert second.iterations == 1
+    assert sum(second.qps.values()) == 1
+    assert not second.multipliers.obstacles.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_iterates_stay_feasible_and_costs_never_rise(kind):
+    """The convex-concave argument: sound half-spaces, tight at the nominal point."""
+    case = instance(kind, 20, "exact", 0.5, 0)
+    for limit in (1, 2, 4):
+        solver = SCP(case.problem, Settings(sides=False, max_iterations=limit, tolerance=1e-7))
+        guess = Trajectory(case.x_ref, np.zeros((20, 2)))
+        costs = []
+        for _ in range(6):
+            plan = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
+            assert plan.ok, plan.status
+            assert plan.kkt.feasibility < 1e-7
+            costs.append(plan.cost)
+            guess = plan.iterate
+        assert all(b <= a + 1e-7 for a, b in pairwise(costs))
+
+
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+def test_plans_obey_the_dynamics_the_bounds_and_the_no_go_sets(inflation):
+    case = instance("ahead", 30, inflation, S_REF, 1)
+    plan = SCP(case.problem).solve(case.x0, case.x_ref, case.obstacles)
+    model = case.problem.model
+    for i in range(30):
+        defect = plan.X[i + 1] - model.step(plan.X[i], plan.U[i])
+        assert np.abs(defect).max() < 1e-7
+    assert (np.abs(plan.U) <= 3.0).all()
+    assert plan.s[0] >= S_REF
+    prediction = case.obstacles[0]
+    for i in range(1, 31):
+        variances, R = np.linalg.eigh(prediction.covariances[i])
+        y = R.T @ (plan.X[i, [0, 2]] - prediction.means[i])
+        semi = S_REF * np.sqrt(variances) + 0.35
+        assert np.linalg.norm(y / semi) >= 1 - 1e-6  # both sets contain the report's ellipse
+
+
+def test_warm_start_cuts_qp_iterations(monkeypatch):
+    """From the shifted plan with its multipliers, OSQP needs a fraction of the cold count."""
+    counts = []
+    accept = TrustedSolver._accepts
+
+    def counting(self, solution):
+        counts.append(solution.iterations)
+        return accept(self, solution)
+
+    monkeypatch.setattr(TrustedSolver, "_accepts", counting)
+    case = instance("beside", 30, "exact", S_REF, 0)
+    settings = Settings(sides=False, qp=QPSettings(max_iterations=20000, rescue=False))
+    solver = SCP(case.problem, settings)
+    plan = solver.solve(case.x0, case.x_ref, case.obstacles)
+    cold = sum(counts)
+    counts.clear()
+    x = case.problem.model.step(case.x0, plan.u0)
+    moved = obstacle(30, tuple(case.obstacles[0].means[1]), (0.1, 0.0), rotated((0.2, 0.15), 0.4))
+    guess = plan.iterate.shifted(case.problem.model)
+    solver.solve(x, case.x_ref + [0.4, 0, 0, 0], [moved], guess)
+    warm = sum(counts)
+    assert 0 < warm < cold / 2
+
+
+def test_more_tolerance_takes_fewer_programs():
+    case = instance("ahead", 30, "exact", S_REF, 0)
+    counts = []
+    for tolerance in (1e-3, 1e-6):
+        solver = SCP(case.problem, Settings(sides=False, tolerance=tolerance))
+        plan = solver.solve(case.x0, case.x_ref, case.obstacles)
+        assert plan.kkt.worst <= tolerance
+        counts.append(plan.iterations)
+    assert counts[0] < counts[1]
+
+
+def blocked():
+    """A robot that cannot avoid the obstacle in time."""
+    case = problem(8)
+    x0 = np.array([0.0, 4.0, 0.0, 0.0])
+    return case, x0, straight_reference(8, 4.0), [obstacle(8, (1.2, 0.05), covariance=np.eye(2))]
+
+
+def test_what_cannot_be_avoided_is_softened_and_said_so():
+    case, x0, ref, obstacles = blocked()
+    plan = SCP(case).solve(x0, ref, obstacles)
+    assert plan.status is Status.SOFTENED
+    assert not plan.ok
+    assert plan.slack.max() > 0.1
+    # The slack is the true violation, stage by stage.
+    value = StepData.read(case, x0, ref, obstacles).half_spaces(case, plan.X, plan.iterate.s).value
+    np.testing.assert_allclose(np.maximum(0.0, -value), plan.slack, atol=1e-6)
+    assert plan.kkt.worst <= 1e-6
+    assert (np.abs(plan.multipliers.obstacles) <= case.slack_weight * (1 + 1e-9)).all()
+
+
+def test_slack_is_exactly_zero_where_a_plan_exists():
+    case = instance("crossing", 20, "exact", S_REF, 1)
+    plan = SCP(case.problem).solve(case.x0, case.x_ref, case.obstacles)
+    assert plan.ok
+    assert plan.slack.max() <= 1e-9
+
+
+def test_running_out_of_iterations_is_said_so():
+    case = instance("ahead", 30, "exact", S_REF, 0)
+    hurried = SCP(case.problem, Settings(sides=False, max_iterations=1))
+    plan = hurried.solve(case.x0, case.x_ref, case.obstacles)
+    assert plan.status is Status.FEASIBLE
+    assert plan.ok
+    assert plan.kkt.worst > 1e-6
+
+
+def test_without_any_solution_the_guess_is_kept_within_limits():
+    case = instance("ahead", 8, "exact", S_REF, 0)
+    dead = Settings(qp=QPSettings(max_iterations=1, check_interval=1, rescue=False))
+    guess = Trajectory(case.x_ref, np.full((8, 2), 7.0))
+    plan = SCP(case.problem, dead).solve(case.x0, case.x_ref, case.obstacles, guess)
+    assert plan.status is Status.FALLBACK
+    assert not plan.ok
+    np.testing.assert_array_equal(plan.U, np.full((8, 2), 3.0))
+    np.testing.assert_array_equal(plan.X[0], case.x0)
+    assert plan.kkt == KKTResiduals(np.inf, np.inf, np.inf)
+    assert plan.multipliers is None
+
+
+def test_other_sides_are_tried_and_never_cost_more():
+    """From a guess that trails behind the obstacle, passing it is better."""
+    case = problem(30, "exact")
+    ref = straight_reference(30, 2.0)
+    slow = [obstacle(30, (3.0, 0.0), (0.3, 0.0))]
+    guess = Trajectory(ref, np.zeros((30, 2)))
+    kept = SCP(case, KEEP_SIDE).solve(ref[0], ref, slow, guess)
+    best = SCP(case).solve(ref[0], ref, slow, guess)
+    assert kept.candidates == 0
+    assert best.candidates == 2
+    assert best.switched
+    assert best.status is Status.CONVERGED
+    assert best.cost < 0.5 * kept.cost
+
+
+def test_cost_reported_is_the_cost_of_the_plan():
+    case = instance("elongated", 20, "axes", 0.5, 1)
+    plan = SCP(case.problem).solve(case.x0, case.x_ref, case.obstacles)
+    Q, R, margin = case.problem.Q, case.problem.R, case.problem.margin
+    cost = margin.weight * (plan.s[0] - margin.reference) ** 2
+    for i in range(20):
+        error = plan.X[i + 1] - case.x_ref[i + 1]
+        cost += error @ Q @ error + plan.U[i] @ R @ plan.U[i]
+    assert plan.cost == pytest.approx(cost, rel=1e-12)
+
+
+def test_several_obstacles_have_a_size_each():
+    case = problem(20, "exact", 0.5, max_obstacles=3)
+    ref = straight_reference(20)
+    two = [obstacle(20, (2.5, 0.1)), obstacle(20, (5.0, -0.3), (-0.2, 0.0))]
+    plan = SCP(case).solve(ref[0], ref, two)
+    assert plan.status is Status.CONVERGED
+    assert plan.s.shape == (2,)
+    assert plan.slack.shape == (2, 20)
+    swapped = SCP(case).solve(ref[0], ref, two[::-1], plan.iterate)
+    assert swapped.cost == pytest.approx(plan.cost, rel=1e-4)
+
+
+def test_three_dimensions():
+    model = DoubleIntegrator(0.1, dim=3)
+    case = problem(15, model=model, Q=[1.0, 0.1] * 3, R=[0.01] * 3)
+    ref = np.zeros((16, 6))
+    ref[:, 0], ref[:, 1] = 0.2 * np.arange(16), 2.0
+    ball = ObstaclePrediction(np.tile([1.5, 0.02, 0.05], (16, 1)), 0.01 * np.eye(3), 0.2)
+    plan = SCP(case).solve(ref[0], ref, [ball])
+    assert plan.ok
+    distance = np.linalg.norm(plan.X[1:, [0, 2, 4]] - ball.means[1:], axis=1)
+    assert distance.min() == pytest.approx(S_REF * 0.1 + 0.35, abs=1e-6)
