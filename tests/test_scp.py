@@ -180,7 +180,9 @@ def test_other_sides_are_tried_and_never_cost_more():
     case = problem(30, "exact")
     ref = straight_reference(30, 2.0)
     slow = [obstacle(30, (3.0, 0.0), (0.3, 0.0))]
-    guess = Trajectory(ref, np.zeros((30, 2)))
+    behind = ref.copy()
+    behind[:, 0] = np.minimum(ref[:, 0], 1.5)
+    guess = Trajectory(behind, np.zeros((30, 2)))
     kept = SCP(case, KEEP_SIDE).solve(ref[0], ref, slow, guess)
     best = SCP(case).solve(ref[0], ref, slow, guess)
     assert kept.candidates == 0

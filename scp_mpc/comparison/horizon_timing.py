@@ -1,7 +1,8 @@
 """How long one control step takes at the report's two horizons, solver by solver.
 
 For N = 8 and N = 30 (scenarios 2 and 1) a closed-loop run is recorded once. Every solver then
-solves its steps from the same guess, in turn, so that the noise of the machine hits all alike:
+solves its steps from the same guess, in turns of shuffled order, so that the machine's noise and
+the state in which one solver leaves its caches to the next hit all alike:
 
     scp_mpc                 from the guess, on the side of the guess: like for like
     scp_mpc (both sides)    default settings, trying the other sides at every step
@@ -16,6 +17,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from scp_mpc.comparison.attempts import Attempts, rows
 from scp_mpc.comparison.ipopt import Ipopt
@@ -50,7 +53,7 @@ def measure(
     Args:
         scenario: Whose problem, with the report's inflation.
         steps: Number of control steps.
-        seed: Seed of the disturbance.
+        seed: Seed of the disturbance and of the solvers' order.
         slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: this many at most.
         advance: Called twice per step, when it is recorded and when it is solved by all.
     """
@@ -69,8 +72,11 @@ def measure(
     ]
     for peer in peers.values():
         _warm_up(peer, sequence[0])
+    order = np.random.default_rng(seed)
     for k, step in enumerate(sequence):
-        for attempts, peer in zip(contest, peers.values(), strict=True):
+        for turn in order.permutation(len(contest)):
+            attempts = contest[turn]
+            peer = peers[attempts.solver]
             if peer is not None and k % every[attempts.solver] == 0:
                 attempts.plans[k] = peer.solve(step.x0, step.x_ref, step.obstacles, step.guess)
         advance()

@@ -35,8 +35,15 @@ def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
                     linewidth=2.2,
                 )
         axes.axvline(1e3 * DT, color="black", linewidth=1.2, linestyle=":")
-        axes.text(
-            1e3 * DT, 0.03, " sampling time", fontsize=11, rotation=90, ha="right", va="bottom"
+        axes.annotate(
+            f"sampling time {DT:g} s",
+            (1e3 * DT, 0.04),
+            xytext=(-5, 0),
+            textcoords="offset points",
+            fontsize=11,
+            rotation=90,
+            ha="right",
+            va="bottom",
         )
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

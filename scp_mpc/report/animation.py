@@ -1,6 +1,7 @@
 """The closest encounter of a run as an animated GIF."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.animation import PillowWriter
@@ -42,9 +43,11 @@ def write_animation(run: ClosedLoop, path: Path) -> Path:
 class _OnePalette(PillowWriter):
     """Gives all frames the same colours, so that what stands still costs nothing: half the size."""
 
+    _frames: list[Any]
+
     def finish(self) -> None:
         """Take the palette from the frame in the middle, where everything is in sight."""
-        palette = self._frames[len(self._frames) // 2].quantize(colors=_COLORS)
+        palette = self._frames[len(self._frames) // 2].quantize(colors=_COLORS, method=2)
         self._frames = [frame.quantize(palette=palette, dither=0) for frame in self._frames]
         super().finish()
 

@@ -37,9 +37,8 @@ class Scene:
         circle = run.reference[:, run.problem.model.position]
         axes.plot(*circle.T, color=REFERENCE, linewidth=4, alpha=0.6, label="reference")
         self._sets = [_polygon(axes, OBSTACLE, alpha) for alpha in _FADING]
-        self._sets[0].set(
-            facecolor=(*to_rgb(OBSTACLE), 0.15), label="no-go sets, now and predicted"
-        )
+        self._sets[0].set(alpha=None, fill=True, facecolor=(*to_rgb(OBSTACLE), 0.15))
+        self._sets[0].set_label("no-go sets, now and predicted")
         (self._path,) = axes.plot([], [], color=ROBOT, linewidth=1.5, label="travelled")
         (self._plan,) = axes.plot(
             [], [], ".-", color=PLAN, linewidth=1.2, markersize=5, label="planned"

@@ -34,7 +34,7 @@ def size_figure(run: ClosedLoop) -> Figure:
     """Draw s between its bounds, and the slack where keeping to them was not possible."""
     times, margin = run.times[:-1], run.problem.margin
     figure, (size, violation) = _panels(run, "size s of the no-go set, and slack")
-    s = [float(plan.s.max(initial=margin.reference)) for plan in run.plans]
+    s = [float(plan.s[0]) for plan in run.plans]
     size.axhline(margin.reference, color=REFERENCE, linewidth=5, label=r"$s_\mathrm{ref}$")
     size.step(times, s, where="post", color=ROBOT, linewidth=2, label="s")
     size.axhline(margin.lower, color=LIMIT, linestyle="--", linewidth=1, label=r"$s_\mathrm{min}$")
@@ -86,7 +86,15 @@ def duration_figure(run: ClosedLoop) -> Figure:
     axes.axhline(1e3 * DT, color=OBSTACLE, linewidth=2, label=f"sampling time {1e3 * DT:.0f} ms")
     axes.axhline(tail, color=HALF_PLANE, linestyle="--", label=f"99 % below {tail:.1f} ms")
     axes.axhline(median, color=PLAN, linestyle="--", label=f"median {median:.1f} ms")
-    axes.plot(run.times[:-1], milliseconds, ".", color=ROBOT, markersize=4, label="one step")
+    axes.plot(
+        run.times[:-1],
+        milliseconds,
+        ".",
+        color=ROBOT,
+        markersize=4,
+        clip_on=False,
+        label="one step",
+    )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_ylabel("wall time [ms]")

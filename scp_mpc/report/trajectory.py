@@ -22,6 +22,7 @@ from scp_mpc.simulation.scenarios import DT
 
 _MOST_ENCOUNTERS = 8  # more of them hide each other
 _LABEL = np.array([2.8, 1.0])  # [m] room for a label
+_HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
 _BEFORE_AND_AFTER = (-1.6, -0.8, 0.0, 0.8)  # [s] from the smallest distance
 
 
@@ -55,11 +56,12 @@ def _draw_whole(axes: Axes, run: ClosedLoop) -> None:
             f"{run.times[k]:.1f} s",
             ha=_anchor(outwards[0], "left", "right"),
             va=_anchor(outwards[1], "bottom", "top"),
+            bbox=_HALO,
         )
         reach = max(reach, float((np.abs(label) + _LABEL).max()))
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
-    axes.set_title(f"{run.times[-1]:.0f} s; no-go sets where the robot is closest", fontsize=11)
+    axes.set_title(f"{run.times[-1]:g} s; no-go sets where the robot is closest", fontsize=11)
 
 
 def _draw_closest(axes: Axes, run: ClosedLoop) -> None:
@@ -81,6 +83,7 @@ def _draw_closest(axes: Axes, run: ClosedLoop) -> None:
             textcoords="offset points",
             ha="center",
             va="center",
+            bbox=_HALO,
         )
     points = np.concatenate(corners)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
