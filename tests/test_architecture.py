@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "scp_mpc"
 FLOORS = [
-    {"errors", "arrays", "trajectory"},
+    {"errors", "arrays", "provenance", "trajectory"},
     {"robots", "obstacles", "settings"},
     {"safety"},
     {"problem"},

@@ -1,5 +1,6 @@
 import json
 import logging
+import os
 import sys
 
 import numpy as np
@@ -27,6 +28,7 @@ from scp_mpc.comparison import (
 )
 from scp_mpc.comparison.attempts import Attempts, rows
 from scp_mpc.comparison.horizon_timing import main, measure
+from scp_mpc.comparison.one_thread import in_one_thread
 from scp_mpc.simulation import SCENARIOS
 from scp_mpc.trajectory import rollout
 
@@ -266,10 +268,13 @@ def test_slsqp_skips_steps_at_long_horizons(monkeypatch):
 def test_missing_casadi_keeps_its_row(monkeypatch, tmp_path, caplog):
     monkeypatch.setitem(sys.modules, "casadi", None)
     monkeypatch.setattr(horizon_timing, "_SCENARIOS", ("scenario-2",))
+    # A new process would not know that casadi is gone.
+    monkeypatch.setattr(horizon_timing, "in_one_thread", lambda task, *given: task(*given))
     echoed = []
     with caplog.at_level(logging.WARNING):
         main(tmp_path / "deep" / "bench.json", tmp_path / "out", 2, 0, echo=echoed.append)
     assert "casadi is not installed" in caplog.text
+    assert "ipopt is not installed: N = 8 is empty" in caplog.text
     content = json.loads((tmp_path / "deep" / "bench.json").read_text())
     ours, _, ipopt, _ = content["rows"]
     assert ipopt == dict.fromkeys(KEYS) | {
@@ -290,5 +295,17 @@ def test_missing_casadi_keeps_its_row(monkeypatch, tmp_path, caplog):
 
 def test_library_prints_nothing(monkeypatch, capfd):
     monkeypatch.setattr(horizon_timing, "_SCENARIOS", ("scenario-2",))
-    main(None, None, steps=1, seed=0)
+    echoed = []
+    main(None, None, steps=1, seed=0, echo=echoed.append)
+    assert len(echoed) == 1
+    assert "| ipopt | 8 | 1 | 1 |" in echoed[0]
     assert capfd.readouterr() == ("", "")
+
+
+def test_one_thread_leaves_the_environment_as_it_was(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    assert in_one_thread(os.getenv, "OMP_NUM_THREADS") == "1"
+    assert in_one_thread(os.getenv, "MKL_NUM_THREADS") == "1"
+    assert os.getenv("OMP_NUM_THREADS") == "3"
+    assert os.getenv("MKL_NUM_THREADS") is None

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from instances import S_REF, obstacle, rotated
 
+from scp_mpc import ObstaclePrediction
 from scp_mpc.safety import AxesInflation, ExactInflation, NoGoSets
 
 STAGES = 6
@@ -159,3 +160,37 @@ def test_robot_on_the_obstacle_gets_a_finite_normal_on_the_side_it_came_from(inf
     assert spaces.normal[0, 0] @ [-0.4, 0.1] > 0
     assert np.isfinite(spaces.normal[0, 1]).all()
     assert np.linalg.norm(spaces.normal[0, 1]) > 0.1
+
+
+@both
+@pytest.mark.parametrize("seed", range(4))
+def test_in_space_against_the_boundary_reached_along_a_normal(inflation, seed):
+    """A covariance whose eigenvectors are no reflection tells R from R'."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3, 3)) * [1.0, 0.5, 0.2]
+    Sigma, mean = root @ root.T, rng.normal(size=3)
+    prediction = ObstaclePrediction(np.tile(mean, (2, 1)), Sigma, 0.2)
+    sets = NoGoSets.from_predictions([prediction], 0.15, 1, 1, 3)
+    n = rng.normal(size=3)
+    n /= np.linalg.norm(n)
+    spread = np.sqrt(n @ Sigma @ n)
+    if inflation is INFLATIONS["exact"]:
+        boundary = mean + S_REF * Sigma @ n / spread + 0.35 * n
+    else:
+        variances, R = np.linalg.eigh(Sigma)
+        semi = S_REF * np.sqrt(variances) + 0.35
+        boundary = mean + R @ (semi * (local := R.T @ n)) / np.linalg.norm(local)
+    s, start = np.array([S_REF]), np.ones((1, 3))
+    spaces = inflation.linearise(sets, boundary[None], s, start)
+    assert spaces.value[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert inflation.clearance(sets, boundary[None])[0, 0] == pytest.approx(0.0, abs=1e-9)
+    if inflation is INFLATIONS["exact"]:
+        np.testing.assert_allclose(spaces.normal[0, 0], n, atol=1e-7)
+        assert spaces.slope[0, 0] == pytest.approx(-spread, abs=1e-9)
+    h = 1e-6
+    for axis in np.eye(3):
+        ahead, behind = (
+            inflation.linearise(sets, (boundary + sign * h * axis)[None], s, start).value[0, 0]
+            for sign in (1, -1)
+        )
+        assert spaces.normal[0, 0] @ axis == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)

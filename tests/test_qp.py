@@ -237,6 +237,11 @@ def test_residuals_of_a_wrong_sign_are_seen():
     assert p.residuals(good.x, good.y).worst < 1e-7
     assert p.residuals(good.x, -good.y).stationarity > 1e-2
     assert p.residuals(good.x + 1.0, good.y).feasibility > 1e-2
+    loose = QuadraticProgram(p.P, p.q, p.A, np.full(20, -np.inf), np.full(20, np.inf))
+    for name, sign in (("upper", 1), ("lower", -1)):
+        getattr(loose, name)[4] = (p.A @ good.x)[4] - sign * 0.3  # one bound, one side
+        assert loose.residuals(good.x, good.y).feasibility == pytest.approx(0.3)
+        getattr(loose, name)[4] = sign * np.inf
     slack = good.y.copy()
     slack[9] = 1.0  # a free row cannot push
     assert p.residuals(good.x, slack).complementarity >= 1.0

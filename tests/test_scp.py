@@ -165,13 +165,17 @@ def test_running_out_of_iterations_is_said_so():
 def test_without_any_solution_the_guess_is_kept_within_limits():
     case = instance("ahead", 8, "exact", S_REF, 0)
     dead = Settings(qp=QPSettings(max_iterations=1, check_interval=1, rescue=False))
-    guess = Trajectory(case.x_ref, np.full((8, 2), 7.0))
+    guess = Trajectory(case.x_ref, np.tile([7.0, 0.0], (8, 1)))
     plan = SCP(case.problem, dead).solve(case.x0, case.x_ref, case.obstacles, guess)
     assert plan.status is Status.FALLBACK
     assert not plan.ok
-    np.testing.assert_array_equal(plan.U, np.full((8, 2), 3.0))
+    np.testing.assert_array_equal(plan.U, np.tile([3.0, 0.0], (8, 1)))
     np.testing.assert_array_equal(plan.X[0], case.x0)
     assert plan.kkt == KKTResiduals(np.inf, np.inf, np.inf)
+    step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
+    value = step.half_spaces(case.problem, plan.X, np.array([S_REF])).value
+    assert value.min() < -0.01
+    np.testing.assert_allclose(plan.slack, np.maximum(0.0, -value), atol=1e-12)
     assert plan.multipliers is None
 
 

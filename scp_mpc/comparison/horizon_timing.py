@@ -13,7 +13,7 @@ Only scp_mpc uses the multipliers of the guess; the peers have no use for them.
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,16 @@ import numpy as np
 
 from scp_mpc.comparison.attempts import Attempts, rows
 from scp_mpc.comparison.ipopt import Ipopt
+from scp_mpc.comparison.one_thread import in_one_thread
 from scp_mpc.comparison.ours import Ours
 from scp_mpc.comparison.peer_plan import Peer, PeerMissingError
-from scp_mpc.comparison.provenance import provenance
 from scp_mpc.comparison.sequence import RecordedStep, record
 from scp_mpc.comparison.slsqp import Slsqp
 from scp_mpc.comparison.timing_figure import timing_figure
 from scp_mpc.comparison.timing_table import timing_table
 from scp_mpc.problem import Problem
-from scp_mpc.settings import require_count
+from scp_mpc.provenance import provenance
+from scp_mpc.settings import Settings, require_count
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
 NAME = "horizon_timing"  # of the files
@@ -48,7 +49,7 @@ def measure(
     slow_steps: int = SLOW_STEPS,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Attempts]:
-    """Record a scenario and let every solver solve its steps.
+    """Record a scenario and let every solver solve its steps, in this process.
 
     Args:
         scenario: Whose problem, with the report's inflation.
@@ -91,7 +92,7 @@ def main(
     slow_steps: int = SLOW_STEPS,
     echo: Callable[[str], None] = _log.info,
 ) -> None:
-    """Run the benchmark, echo its table and write its files.
+    """Run the benchmark in a process of one thread, echo its table and write its files.
 
     Args:
         json_path: File for {"rows": [...], "provenance": {...}}; None for no such file.
@@ -101,11 +102,11 @@ def main(
         slow_steps: See `measure`.
         echo: Takes the Markdown table.
     """
-    with _progress(2 * steps * len(_SCENARIOS)) as advance:
-        contests = [
-            measure(SCENARIOS[name], steps, seed, slow_steps, advance) for name in _SCENARIOS
-        ]
+    contests = in_one_thread(_contests, _SCENARIOS, steps, seed, slow_steps)
     summary = [row for contest in contests for row in rows(contest)]
+    for row in summary:
+        if row["median_ms"] is None:
+            _log.warning("%s is not installed: N = %d is empty", row["solver"], row["horizon"])
     origin = provenance()
     table = timing_table(summary, origin)
     echo(table)
@@ -119,6 +120,12 @@ def main(
         timing_figure(contests).savefig(out / f"{NAME}.png", dpi=150)
 
 
+def _contests(names: Sequence[str], steps: int, seed: int, slow_steps: int) -> list[list[Attempts]]:
+    """One contest per scenario, with a progress bar on a terminal."""
+    with _progress(2 * steps * len(names)) as advance:
+        return [measure(SCENARIOS[name], steps, seed, slow_steps, advance) for name in names]
+
+
 def _peers(problem: Problem) -> dict[str, Peer | None]:
     """The solvers by name; None for one that is not installed, whose row is kept."""
     ipopt: Peer | None = None
@@ -127,7 +134,7 @@ def _peers(problem: Problem) -> dict[str, Peer | None]:
     except PeerMissingError as error:
         _log.warning("ipopt has no results: %s", error)
     return {
-        "scp_mpc": Ours(problem),
+        "scp_mpc": Ours(problem, Settings(sides=False)),
         "scp_mpc (both sides)": Ours(problem, challenge=True),
         "ipopt": ipopt,
         "slsqp": Slsqp(problem),

@@ -22,8 +22,7 @@ class Ours:
     Args:
         problem: What to solve.
         settings: How to solve it.
-        challenge: Try the other sides too, at every step. Without it the solver keeps to the
-            side of its guess, as the peers do.
+        challenge: Try the other sides at every step, not only where the guess's own fails.
     """
 
     def __init__(

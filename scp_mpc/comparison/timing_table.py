@@ -15,8 +15,9 @@ def timing_table(summary: Sequence[Row], origin: Mapping[str, str | int | None])
     """Return the table of all rows, with a line on where they were measured."""
     versions = ", ".join(f"{name} {origin[name] or 'missing'}" for name in ("osqp", "casadi"))
     source = (
-        f"Measured on {origin['machine']}, {origin['cores']} cores, Python {origin['python']}, "
-        f"{versions}, commit {origin['commit'] or 'unknown'}, {origin['date']}."
+        f"Measured on {origin['machine']}, {origin['cores']} cores, one thread, "
+        f"Python {origin['python']}, {versions}, "
+        f"commit {origin['commit'] or 'unknown'}, {origin['date']}."
     )
     return "\n".join([_HEAD, *(_line(row) for row in summary), "", source])
 

@@ -4,15 +4,14 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.provenance import provenance
 from scp_mpc.report.encounters import slack_steps
-from scp_mpc.report.machine import machine
 from scp_mpc.report.table import markdown_report
 from scp_mpc.simulation.closed_loop import ClosedLoop
 from scp_mpc.simulation.scenarios import DT
@@ -69,8 +68,7 @@ def summarise_all(runs: Sequence[ClosedLoop]) -> dict[str, Any]:
         "seed": first.seed,
         "inflation": first.problem.inflation,
         "margin": asdict(first.problem.margin),
-        "version": version("scp-mpc"),
-        "machine": machine(),
+        "provenance": provenance(),
     }
 
 

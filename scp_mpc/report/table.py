@@ -82,12 +82,12 @@ def markdown_table(scenarios: Sequence[dict[str, Any]]) -> str:
 
 def markdown_report(summary: dict[str, Any]) -> str:
     """Return the table with its legend and its provenance."""
-    host, margin = summary["machine"], summary["margin"]
-    provenance = (
-        f"scp-mpc {summary['version']}, seed {summary['seed']}, inflation "
+    origin, margin = summary["provenance"], summary["margin"]
+    source = (
+        f"scp-mpc {origin['scp-mpc']}, seed {summary['seed']}, inflation "
         f'"{summary["inflation"]}", s_min = {margin["lower"]:.4f}, s_ref = '
-        f"{margin['reference']:.4f}; {host['processor']}, {host['cpu_count']} CPUs, Python "
-        f"{host['python']}, NumPy {host['numpy']}, OSQP {host['osqp']}.\n"
+        f"{margin['reference']:.4f}; {origin['machine']}, {origin['cores']} cores, Python "
+        f"{origin['python']}, NumPy {origin['numpy']}, OSQP {origin['osqp']}.\n"
     )
     table = markdown_table(summary["scenarios"])
-    return f"# Closed-loop runs\n\n{table}\n{_LEGEND}\n{provenance}"
+    return f"# Closed-loop runs\n\n{table}\n{_LEGEND}\n{source}"

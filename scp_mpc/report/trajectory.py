@@ -31,7 +31,7 @@ def trajectory_figure(run: ClosedLoop) -> Figure:
 
     Every no-go set is that of its own step, sized by the s of that step's plan.
     """
-    figure = new_figure(11.0, 6.6)
+    figure = new_figure(11.0, 6.4)
     name = f"{run.scenario.name}: {run.scenario.title.lower()}, N = {run.problem.horizon}"
     figure.suptitle(name, fontsize=13)
     whole, close = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)

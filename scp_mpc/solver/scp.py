@@ -79,7 +79,7 @@ class SCP:
             x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
             obstacles: At most `max_obstacles` predictions over the same horizon.
             guess: Where to linearise first; None for the plan that ignores the obstacles.
-            challenge: Try the other sides too, unless `settings.sides` is off.
+            challenge: Try the other sides even if this one works, unless `settings.sides` is off.
 
         Raises:
             InvalidArgumentError: Or one of its subclasses, before anything is changed.
@@ -95,7 +95,8 @@ class SCP:
         nominal = nominal or self._free_plan(step)
         best = self._descend(step, nominal, self.settings.max_iterations)
         tried, switched = 0, False
-        if challenge and self.settings.sides and best.iterate.touches:
+        wanted = not best.status.ok or (challenge and best.iterate.touches)
+        if self.settings.sides and wanted:
             best, tried, switched = self._challenge(step, best)
         return self._plan(step, best, tried, switched, began)
 

@@ -1,0 +1,33 @@
+"""The README's example runs as printed, and its links lead somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_there_is_an_example():
+    assert EXAMPLES
+    lines = [line for line in EXAMPLES[0].splitlines() if line.strip()]
+    assert len(lines) <= 20
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_examples_run(example, capsys):
+    names: dict[str, object] = {}
+    exec(compile(example, "README.md", "exec"), names)
+    plan = names["plan"]
+    assert plan.ok
+    assert str(plan.status) in capsys.readouterr().out
+
+
+def test_links_within_the_project_lead_somewhere():
+    targets = re.findall(r"\]\(([^)#]+)", README) + re.findall(r'src="([^"]+)"', README)
+    local = [t for t in targets if "://" not in t]
+    assert len(local) >= 4
+    for target in local:
+        assert (ROOT / target).exists(), target
