@@ -13,9 +13,7 @@ class Status(Enum):
 
     CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
     FEASIBLE = "Iterations ran out; the plan meets every constraint but is not certified optimal."
-    SOFTENED = (
-        "No plan nearby meets every constraint; this one violates them least, by its slack."
-    )
+    SOFTENED = "No plan nearby meets every constraint; this one violates them least, by its slack."
     VIOLATING = "Iterations ran out and the plan still enters a no-go set."
     FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
 
