@@ -18,6 +18,8 @@ class QPSettings:
         check_interval: Iterations between OSQP's checks for termination.
         rho: OSQP's initial step size.
         rescue: Whether to ask PIQP for what OSQP does not bring to `accuracy`.
+        cold: KKT residual of the starting point, relative to the cost's largest gradient at zero,
+            beyond which PIQP is asked first: the worse the start, the more iterations OSQP needs.
     """
 
     accuracy: float = 1e-7
@@ -26,10 +28,11 @@ class QPSettings:
     check_interval: int = 10
     rho: float = 0.1
     rescue: bool = True
+    cold: float = 0.3
 
     def __post_init__(self) -> None:
         """Check every number, because OSQP does not."""
-        for name in ("accuracy", "eps", "rho"):
+        for name in ("accuracy", "eps", "rho", "cold"):
             require_positive(name, getattr(self, name))
         for name in ("max_iterations", "check_interval"):
             require_count(name, getattr(self, name))

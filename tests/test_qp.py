@@ -226,6 +226,17 @@ def test_what_osqp_does_not_finish_goes_to_the_rescue():
     np.testing.assert_allclose(rescued.x, plain.x, atol=1e-6)
 
 
+def test_a_bad_start_goes_to_the_rescue_first():
+    """The KKT residual of the start, relative to the cost's gradient, decides."""
+    p = program()
+    solver = TrustedSolver(p, QPSettings(cold=0.5))
+    scale = max(1.0, np.abs(p.q).max())
+    for residual, expected in ((0.4 * scale, "osqp"), (0.6 * scale, "piqp"), (0.0, "osqp")):
+        assert solver.solve(np.zeros(12), np.zeros(20), residual).solver == expected
+    alone = TrustedSolver(p, QPSettings(cold=0.5, rescue=False))
+    assert alone.solve(np.zeros(12), np.zeros(20), 9.9 * scale).solver == "osqp"
+
+
 def test_without_a_rescue_nothing_inaccurate_comes_out():
     settings = QPSettings(max_iterations=1, check_interval=1, rescue=False)
     assert TrustedSolver(program(), settings).solve(np.zeros(12), np.zeros(20)) is None

@@ -102,18 +102,17 @@ class SCP:
 
     def _descend(self, step: StepData, nominal: Iterate, limit: int) -> Descent:
         """Run the loop from one nominal plan, for at most `limit` subproblems."""
-        iterate, residuals, iterations = nominal, KKTResiduals(np.inf, np.inf, np.inf), 0
-        self._subproblem.soft = bool(nominal.slack.max(initial=0.0) > self.settings.tolerance)
-        self._linearise_about(step, nominal)
-        while residuals.worst > self.settings.tolerance and iterations < limit:
-            convex = self._solve_convex(iterate)
+        tolerance = self.settings.tolerance
+        self._subproblem.soft = bool(nominal.slack.max(initial=0.0) > tolerance)
+        iterate, iterations = self._subproblem.started(nominal), 0
+        residuals = self._linearise_about(step, iterate)
+        while residuals.worst > tolerance and iterations < limit:
+            convex = self._solve_convex(iterate, residuals)
             if convex is None:
                 break
-            iterate = convex
-            self._linearise_about(step, iterate)
-            residuals = self._subproblem.residuals(iterate)
-            iterations += 1
-        if iterations == 0:
+            iterate, iterations = convex, iterations + 1
+            residuals = self._linearise_about(step, iterate)
+        if iterations == 0 and residuals.worst > tolerance:
             return self._given_up(step, nominal)
         status = self._judge(residuals, iterate)
         return Descent(iterate, self._cost(step, iterate), residuals, status, iterations)
@@ -137,22 +136,25 @@ class SCP:
             best = self._descend(step, best.iterate, self.settings.max_iterations)
         return best, len(starts), best is not incumbent
 
-    def _solve_convex(self, iterate: Iterate) -> Iterate | None:
+    def _solve_convex(self, iterate: Iterate, residuals: KKTResiduals) -> Iterate | None:
         """Solve the subproblem as it stands; soften it if nothing meets all constraints."""
         began = perf_counter()
         z, y = self._subproblem.pack(iterate)
-        solution = self._qp.solve(z, y)
+        solution = self._qp.solve(z, y, residuals.worst)
         if solution is None and not self._subproblem.soft:
             self._subproblem.soft = True
-            solution = self._qp.solve(z, y)
+            solution = self._qp.solve(z, y, residuals.worst)
         self._solving += perf_counter() - began
         return None if solution is None else self._subproblem.unpack(solution.x, solution.y)
 
-    def _linearise_about(self, step: StepData, iterate: Iterate) -> None:
+    def _linearise_about(self, step: StepData, iterate: Iterate) -> KKTResiduals:
+        """Write the half-spaces about an iterate; return its residuals in the original problem."""
         began = perf_counter()
         spaces = step.half_spaces(self.problem, iterate.states, iterate.s)
         self._subproblem.write_half_spaces(spaces)
+        residuals = self._subproblem.residuals(iterate)
         self._linearising += perf_counter() - began
+        return residuals
 
     def _free_plan(self, step: StepData) -> Iterate:
         """The plan that ignores the obstacles; its cost bounds every other from below."""
@@ -162,7 +164,7 @@ class SCP:
             HalfSpaces.none(problem.max_obstacles, problem.horizon, problem.model.dim)
         )
         nominal = self._subproblem.resting(step.x_ref)
-        return self._solve_convex(nominal) or nominal
+        return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
 
     def _judge(self, residuals: KKTResiduals, iterate: Iterate) -> Status:
         tolerance = self.settings.tolerance

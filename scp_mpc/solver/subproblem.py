@@ -11,6 +11,8 @@ Notation:
 OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import sparse
 
@@ -119,6 +121,10 @@ class Subproblem:
     def residuals(self, iterate: Iterate) -> KKTResiduals:
         """KKT residuals of the program as it stands at an iterate and its multipliers."""
         return self.program.residuals(*self.pack(iterate))
+
+    def started(self, iterate: Iterate) -> Iterate:
+        """The iterate with the state of this control step in row 0."""
+        return replace(iterate, states=np.concatenate([self._x0[None], iterate.states[1:]]))
 
     def resting(self, states: FloatArray) -> Iterate:
         """An iterate with the given states (N+1, nx), no input, s = s_ref and no slack."""

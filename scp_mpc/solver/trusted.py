@@ -3,6 +3,8 @@
 from collections import Counter
 from collections.abc import Iterator
 
+import numpy as np
+
 from scp_mpc.arrays import FloatArray
 from scp_mpc.settings import QPSettings
 from scp_mpc.solver.program import QuadraticProgram
@@ -21,17 +23,23 @@ class TrustedSolver:
     def __init__(self, program: QuadraticProgram, settings: QPSettings) -> None:
         """Set up OSQP for the pattern of `program`, whose values are read at each solve."""
         self._program = program
-        self._accuracy = settings.accuracy
+        self._accuracy, self._cold = settings.accuracy, settings.cold
         self._osqp = OSQPSolver(program, settings)
         self._rescue = None if not settings.rescue else RescueSolver(program)
         self.finished: Counter[str] = Counter()
         self.seconds = 0.0
 
-    def solve(self, x: FloatArray, y: FloatArray) -> QPSolution | None:
-        """Solve the program as it stands, warm-started at x and y; None if nobody could."""
+    def solve(self, x: FloatArray, y: FloatArray, residual: float = 0.0) -> QPSolution | None:
+        """Solve the program as it stands, warm-started at x and y; None if nobody could.
+
+        Args:
+            x: (n,) start.
+            y: (m,) its multipliers.
+            residual: KKT residual of the start; a bad one is left to the rescue at once.
+        """
         program = self._program
-        self._osqp.update(program.q, program.A.data, program.lower, program.upper)
-        for solution in self._attempts(x, y):
+        cold = residual > self._cold * max(1.0, float(np.abs(program.q).max()))
+        for solution in self._attempts(x, y, cold):
             self.seconds += solution.seconds
             if self._accepts(solution):
                 self.finished[solution.solver] += 1
@@ -47,9 +55,13 @@ class TrustedSolver:
         self.finished = Counter()
         self.seconds = 0.0
 
-    def _attempts(self, x: FloatArray, y: FloatArray) -> Iterator[QPSolution]:
+    def _attempts(self, x: FloatArray, y: FloatArray, cold: bool) -> Iterator[QPSolution]:
+        if cold and self._rescue is not None:
+            yield self._rescue.solve()
+        program = self._program
+        self._osqp.update(program.q, program.A.data, program.lower, program.upper)
         yield self._osqp.solve(x, y)
-        if self._rescue is not None:
+        if not cold and self._rescue is not None:
             yield self._rescue.solve()
 
     def _accepts(self, solution: QPSolution) -> bool:
