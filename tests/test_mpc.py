@@ -267,3 +267,11 @@ def test_obstacles_may_come_and_go():
         plan = mpc.step(ref[0], ref, present)
         assert plan.ok, plan.status
         assert plan.s.shape == (len(present),)
+
+
+def test_a_plan_cannot_be_edited_into_the_next_step():
+    mpc = MPC(problem(N))
+    plan = mpc.step(**good())
+    for array in (plan.X, plan.U, plan.s, plan.slack, plan.u0):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 7.0

@@ -12,6 +12,8 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.robots.linear import LinearModel
 
+_NEGLIGIBLE = 1e-6  # [cost / m]; an interior-point solver leaves no multiplier exactly zero
+
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:
@@ -55,7 +57,14 @@ class Iterate:
     @property
     def touches(self) -> bool:
         """Whether an obstacle may shape this point: an active constraint, or no multipliers."""
-        return self.multipliers is None or bool(self.multipliers.obstacles.any())
+        duals = self.multipliers
+        return duals is None or bool((duals.obstacles < -_NEGLIGIBLE).any())
+
+    def frozen(self) -> "Iterate":
+        """Mark the primal arrays read-only: a plan shares them with the next step's guess."""
+        for array in (self.states, self.inputs, self.s, self.slack):
+            array.setflags(write=False)
+        return self
 
     def shifted(self, model: LinearModel) -> "Iterate":
         """Return the iterate one step later: the last input is held, its end state appended."""

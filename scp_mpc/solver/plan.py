@@ -22,6 +22,11 @@ class Status(Enum):
         """Whether every constraint of the problem holds."""
         return self in (Status.CONVERGED, Status.FEASIBLE)
 
+    @property
+    def certified(self) -> bool:
+        """Whether the KKT conditions hold, with slack or without."""
+        return self in (Status.CONVERGED, Status.SOFTENED)
+
 
 @dataclass(frozen=True)
 class Timing:

@@ -39,13 +39,20 @@ _EXPLORATION = 5
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where one run of the loop ended."""
+    """Where one run of the loop ended; `merit` is its cost and the penalty on its slack."""
 
     iterate: Iterate
     cost: float
+    merit: float
     residuals: KKTResiduals
     status: Status
     iterations: int
+
+    def beats(self, other: "Descent", lead: float) -> bool:
+        """Whether this end is safe and the other is not, or its merit is better by `lead`."""
+        if self.status.ok != other.status.ok:
+            return self.status.ok
+        return self.merit < other.merit - lead
 
 
 class SCP:
@@ -114,14 +121,13 @@ class SCP:
             residuals = self._linearise_about(step, iterate)
         if iterations == 0 and residuals.worst > tolerance:
             return self._given_up(step, nominal)
-        status = self._judge(residuals, iterate)
-        return Descent(iterate, self._cost(step, iterate), residuals, status, iterations)
+        return self._ended(step, iterate, residuals, self._judge(residuals, iterate), iterations)
 
     def _challenge(self, step: StepData, best: Descent) -> tuple[Descent, int, bool]:
         """Try the other sides, if there is something to win."""
         free = self._free_plan(step)
-        most = best.cost - self._cost(step, free)  # no plan costs less than the free one
-        if best.status.ok and most <= _HYSTERESIS * best.cost:
+        most = best.merit - self._cost(step, free)  # no plan costs less than the free one
+        if most <= _HYSTERESIS * best.merit:
             return best, 0, False
         position = self.problem.model.position
         value = step.half_spaces(self.problem, free.states, free.s).value
@@ -129,10 +135,9 @@ class SCP:
         incumbent = best
         for start in starts:
             rival = self._descend(step, start, _EXPLORATION)
-            ahead = not best.status.ok or rival.cost < best.cost - _HYSTERESIS * most
-            if rival.status.ok and ahead:
+            if rival.beats(best, _HYSTERESIS * most):
                 best = rival
-        if best is not incumbent and best.status is Status.FEASIBLE:
+        if best is not incumbent and not best.status.certified:
             best = self._descend(step, best.iterate, self.settings.max_iterations)
         return best, len(starts), best is not incumbent
 
@@ -182,7 +187,19 @@ class SCP:
         value = step.half_spaces(problem, path.states, s).value
         iterate = Iterate(path.states, inputs, s, np.maximum(0.0, -value))
         unknown = KKTResiduals(np.inf, np.inf, np.inf)
-        return Descent(iterate, self._cost(step, iterate), unknown, Status.FALLBACK, 0)
+        return self._ended(step, iterate, unknown, Status.FALLBACK, 0)
+
+    def _ended(
+        self,
+        step: StepData,
+        iterate: Iterate,
+        residuals: KKTResiduals,
+        status: Status,
+        iterations: int,
+    ) -> Descent:
+        cost = self._cost(step, iterate)
+        merit = cost + self.problem.slack_weight * float(iterate.slack.sum())
+        return Descent(iterate.frozen(), cost, merit, residuals, status, iterations)
 
     def _cost(self, step: StepData, iterate: Iterate) -> float:
         return self.problem.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)
