@@ -45,6 +45,7 @@ class Settings:
     Attributes:
         tolerance: KKT residual of the original problem at which a plan is certified.
         max_iterations: Convex subproblems per control step at most.
+        acceleration: Extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
         qp: Settings of the quadratic program's solvers.
@@ -52,6 +53,7 @@ class Settings:
 
     tolerance: float = 1e-6
     max_iterations: int = 40
+    acceleration: bool = True
     sides: bool = True
     sides_interval: int = 2
     qp: QPSettings = field(default_factory=QPSettings)

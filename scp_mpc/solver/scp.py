@@ -4,6 +4,7 @@
     repeat:  half-spaces about the nominal -> values of the QP -> solve, warm-started in x and y
              -> new nominal -> half-spaces about it -> KKT residual of the original problem
     until    that residual is below the tolerance, or the iterations run out
+             (from the third time on, about a point extrapolated from the last two nominals)
 
 A half-space about a point is exact there. So the KKT residual of the *next* QP at the present
 point and multipliers is the KKT residual of the original problem: the certificate costs one
@@ -21,6 +22,7 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.settings import Settings
+from scp_mpc.solver.acceleration import Anderson
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Plan, Status, Timing
@@ -113,11 +115,14 @@ class SCP:
         self._subproblem.soft = bool(nominal.slack.max(initial=0.0) > tolerance)
         iterate, iterations = self._subproblem.started(nominal), 0
         residuals = self._linearise_about(step, iterate)
+        acceleration = Anderson(iterate, self.problem.model.position)
         while residuals.worst > tolerance and iterations < limit:
-            convex = self._solve_convex(iterate, residuals)
+            convex = self._improve(step, iterate, residuals, acceleration)
             if convex is None:
                 break
             iterate, iterations = convex, iterations + 1
+            if self.settings.acceleration:
+                acceleration.learn(iterate)
             residuals = self._linearise_about(step, iterate)
         if iterations == 0 and residuals.worst > tolerance:
             return self._given_up(step, nominal)
@@ -141,25 +146,41 @@ class SCP:
             best = self._descend(step, best.iterate, self.settings.max_iterations)
         return best, len(starts), best is not incumbent
 
+    def _improve(
+        self, step: StepData, iterate: Iterate, residuals: KKTResiduals, acceleration: Anderson
+    ) -> Iterate | None:
+        """Solve one subproblem: about the extrapolated point if that helps, else the iterate."""
+        bold = acceleration.propose(iterate)
+        if bold is not None:
+            self._write_half_spaces(step, bold)
+            convex = self._solve_convex(iterate, residuals)
+            if convex is not None and self._merit(step, convex) <= self._merit(step, iterate):
+                return convex
+            acceleration.reject()
+            self._write_half_spaces(step, iterate)
+        convex = self._solve_convex(iterate, residuals)
+        if convex is None and not self._subproblem.soft:
+            self._subproblem.soft = True  # no plan meets all the half-spaces
+            convex = self._solve_convex(iterate, residuals)
+        return convex
+
     def _solve_convex(self, iterate: Iterate, residuals: KKTResiduals) -> Iterate | None:
-        """Solve the subproblem as it stands; soften it if nothing meets all constraints."""
+        """Solve the subproblem as it stands, warm-started at an iterate."""
         began = perf_counter()
-        z, y = self._subproblem.pack(iterate)
-        solution = self._qp.solve(z, y, residuals.worst)
-        if solution is None and not self._subproblem.soft:
-            self._subproblem.soft = True
-            solution = self._qp.solve(z, y, residuals.worst)
+        solution = self._qp.solve(*self._subproblem.pack(iterate), residuals.worst)
         self._solving += perf_counter() - began
         return None if solution is None else self._subproblem.unpack(solution.x, solution.y)
 
     def _linearise_about(self, step: StepData, iterate: Iterate) -> KKTResiduals:
         """Write the half-spaces about an iterate; return its residuals in the original problem."""
+        self._write_half_spaces(step, iterate)
+        return self._subproblem.residuals(iterate)
+
+    def _write_half_spaces(self, step: StepData, iterate: Iterate) -> None:
         began = perf_counter()
         spaces = step.half_spaces(self.problem, iterate.states, iterate.s)
         self._subproblem.write_half_spaces(spaces)
-        residuals = self._subproblem.residuals(iterate)
         self._linearising += perf_counter() - began
-        return residuals
 
     def _free_plan(self, step: StepData) -> Iterate:
         """The plan that ignores the obstacles; its cost bounds every other from below."""
@@ -197,9 +218,13 @@ class SCP:
         status: Status,
         iterations: int,
     ) -> Descent:
-        cost = self._cost(step, iterate)
-        merit = cost + self.problem.slack_weight * float(iterate.slack.sum())
+        cost, merit = self._cost(step, iterate), self._merit(step, iterate)
         return Descent(iterate.frozen(), cost, merit, residuals, status, iterations)
+
+    def _merit(self, step: StepData, iterate: Iterate) -> float:
+        """Cost and the penalty on the slack."""
+        penalty = self.problem.slack_weight * float(iterate.slack.sum())
+        return self._cost(step, iterate) + penalty
 
     def _cost(self, step: StepData, iterate: Iterate) -> float:
         return self.problem.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)
