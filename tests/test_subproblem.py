@@ -102,6 +102,13 @@ def test_equals_the_dense_rebuild(dim, soft):
     np.testing.assert_allclose(program.upper, upper, rtol=1e-15)
 
 
+def test_no_zero_is_stored_in_the_hessian():
+    """With diagonal weights, one entry for each state, input and size; none for the slack."""
+    N, M = 30, 12
+    P = Subproblem(problem(N, max_obstacles=M)).program.P
+    assert P.nnz == N * 6 + M
+
+
 def test_updated_equals_freshly_built_and_keeps_its_pattern():
     this, step, spaces, fresh = random_program(seed=1)
     _, other_step, other_spaces, _ = random_program(seed=2)

@@ -137,8 +137,10 @@ class Subproblem:
         problem = self._problem
         N, M = problem.horizon, problem.max_obstacles
         blocks = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
-        blocks += [problem.margin.weight * np.eye(M), np.zeros((M * N, M * N))]
-        return sparse.csc_matrix(2 * sparse.block_diag(blocks, format="csc"))
+        blocks += [problem.margin.weight * np.eye(M), sparse.csc_matrix((M * N, M * N))]
+        hessian = sparse.csc_matrix(2 * sparse.block_diag(blocks, format="csc"))
+        hessian.eliminate_zeros()  # a dense block is stored with its zeros, which fill the factors
+        return hessian
 
     def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict[str, IntArray]]:
         problem = self._problem
