@@ -5,6 +5,7 @@ from importlib.metadata import version
 from scp_mpc.control import MPC, CircularReference
 from scp_mpc.errors import (
     BoundsError,
+    ConcurrentUseError,
     CovarianceError,
     InvalidArgumentError,
     NotFiniteError,
@@ -32,6 +33,7 @@ __all__ = [
     "BoundsError",
     "CircularObstacle",
     "CircularReference",
+    "ConcurrentUseError",
     "ConstantVelocityPredictor",
     "CovarianceError",
     "DoubleIntegrator",

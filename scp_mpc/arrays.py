@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scp_mpc.errors import CovarianceError, InvalidArgumentError, NotFiniteError, ShapeError
+from scp_mpc.errors import (
+    BoundsError,
+    CovarianceError,
+    InvalidArgumentError,
+    NotFiniteError,
+    ShapeError,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
+
+_LARGEST = 1e15
 
 
 def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
@@ -30,6 +38,8 @@ def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Float
         raw = np.asarray(value)
         if raw.dtype.kind not in "biuf":
             raise TypeError(f"dtype {raw.dtype}")
+        if np.ma.is_masked(value):
+            raise TypeError("masked entries")
         array = np.array(raw, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(argument, f"not an array of real numbers ({error})") from None
@@ -41,12 +51,32 @@ def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Float
 
 
 def require_finite(argument: str, array: FloatArray) -> None:
-    """Raise `NotFiniteError` with the place and the value of the first entry that is not finite."""
-    finite = np.isfinite(array)
-    if not finite.all():
-        place = tuple(int(i) for i in np.argwhere(~finite)[0])
+    """Raise with the place and the value of the first entry that is not finite, or absurd.
+
+    Raises:
+        NotFiniteError: NaN or infinity.
+        BoundsError: A magnitude beyond 1e15, where float64 resolves no more than metres.
+    """
+    if array.size and not np.abs(array).max() <= _LARGEST:
+        place = tuple(int(i) for i in np.argwhere(~(np.abs(array) <= _LARGEST))[0])
         where = f" at index {place}" if place else ""
+        if np.isfinite(array[place]):
+            raise BoundsError(argument, f"{array[place]}{where} exceeds {_LARGEST:g}")
         raise NotFiniteError(argument, f"{array[place]}{where} is not finite")
+
+
+def as_count(argument: str, value: object, least: int = 1) -> int:
+    """Return a whole number of at least `least` as an int.
+
+    Raises:
+        InvalidArgumentError: It is not a whole number.
+        BoundsError: It is too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InvalidArgumentError(argument, f"{value!r} is not a whole number")
+    if value < least:
+        raise BoundsError(argument, f"{value} is less than {least}")
+    return int(value)
 
 
 def as_number(argument: str, value: Any) -> float:

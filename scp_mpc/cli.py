@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 from scp_mpc import Margin, ScpMpcError, Settings, __version__
+from scp_mpc.arrays import as_count
 from scp_mpc.errors import BoundsError
 from scp_mpc.problem import Problem
 from scp_mpc.report import COLUMNS, write_animation, write_figures, write_summary
-from scp_mpc.settings import require_count
 from scp_mpc.simulation import SCENARIOS, STEPS, ClosedLoop, simulate
 
 try:
@@ -70,7 +70,7 @@ def report(
         settings = Settings(sides=sides)
         shape = cast(Literal["axes", "exact"], inflation)  # the problem checks it
         problems = {name: o.problem(shape, margin) for name, o in SCENARIOS.items()}
-        require_count("steps", steps)
+        as_count("steps", steps)
         if seed < 0:
             raise BoundsError("seed", f"{seed} is negative")
         out.mkdir(parents=True, exist_ok=True)

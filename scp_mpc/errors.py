@@ -15,12 +15,16 @@ class InvalidArgumentError(ScpMpcError, ValueError):
 
     Attributes:
         argument: Name of the argument as the caller wrote it.
+        problem: What is wrong with it, with the offending number.
     """
 
     def __init__(self, argument: str, problem: str) -> None:
-        """Compose the message `argument: problem`."""
-        super().__init__(f"{argument}: {problem}")
-        self.argument = argument
+        super().__init__(argument, problem)
+        self.argument, self.problem = argument, problem
+
+    def __str__(self) -> str:
+        """Return `argument: problem`."""
+        return f"{self.argument}: {self.problem}"
 
 
 class ShapeError(InvalidArgumentError):
@@ -37,6 +41,10 @@ class CovarianceError(InvalidArgumentError):
 
 class BoundsError(InvalidArgumentError):
     """A lower bound exceeds its upper bound, or a size has the wrong sign."""
+
+
+class ConcurrentUseError(ScpMpcError):
+    """One solver was called from two threads at once; each needs its own."""
 
 
 class TooManyObstaclesError(InvalidArgumentError):

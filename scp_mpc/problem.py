@@ -9,17 +9,18 @@
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given.
 """
 
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray, as_array, as_number, as_weight, frozen
+from scp_mpc.arrays import FloatArray, as_array, as_count, as_number, as_weight, frozen
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
-from scp_mpc.settings import require_count, require_positive
+from scp_mpc.settings import require_positive
 
 CHI_SQUARE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom
 
@@ -91,7 +92,6 @@ class Problem:
     inflation: Literal["exact", "axes"]
     max_obstacles: int
     slack_weight: float
-    _shape: Inflation = field(repr=False)
 
     def __init__(
         self,
@@ -112,19 +112,20 @@ class Problem:
         """Copy, check and freeze."""
         if not isinstance(model, LinearModel):
             raise InvalidArgumentError("model", f"{model!r} is not a LinearModel")
-        require_count("horizon", horizon)
+        horizon = as_count("horizon", horizon)
         lower, upper = _bounds(u_min, u_max, model.nu)
         radius = as_number("robot_radius", robot_radius)
         if radius < 0:
             raise BoundsError("robot_radius", f"{radius} m is negative")
-        if inflation not in _INFLATIONS:
+        if not isinstance(inflation, str) or inflation not in _INFLATIONS:
             raise InvalidArgumentError(
                 "inflation", f"{inflation!r} is none of {', '.join(_INFLATIONS)}"
             )
-        if max_obstacles != 0:
-            require_count("max_obstacles", max_obstacles)
+        max_obstacles = as_count("max_obstacles", max_obstacles, least=0)
         require_positive("slack_weight", slack_weight)
         margin = Margin() if margin is None else margin
+        if not isinstance(margin, Margin):
+            raise InvalidArgumentError("margin", f"{margin!r} is not a Margin")
         values = {
             "model": model,
             "horizon": horizon,
@@ -138,15 +139,14 @@ class Problem:
             "inflation": inflation,
             "max_obstacles": max_obstacles,
             "slack_weight": float(slack_weight),
-            "_shape": _INFLATIONS[inflation](margin.reference),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    @property
+    @cached_property
     def no_go(self) -> Inflation:
         """The inflation's geometry."""
-        return self._shape
+        return _INFLATIONS[self.inflation](self.margin.reference)
 
     def cost(
         self, states: FloatArray, inputs: FloatArray, s: FloatArray, x_ref: FloatArray

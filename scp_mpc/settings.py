@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from scp_mpc.arrays import as_number
+from scp_mpc.arrays import as_count, as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 
 
@@ -18,8 +18,8 @@ class QPSettings:
         check_interval: Iterations between OSQP's checks for termination.
         rho: OSQP's initial step size.
         rescue: Whether to ask PIQP for what OSQP does not bring to `accuracy`.
-        cold: KKT residual of the starting point, relative to the cost's largest gradient at zero,
-            beyond which PIQP is asked first: the worse the start, the more iterations OSQP needs.
+        cold: KKT residual of the starting point beyond which PIQP is asked first: the worse the
+            start, the more iterations OSQP needs.
     """
 
     accuracy: float = 1e-7
@@ -28,14 +28,15 @@ class QPSettings:
     check_interval: int = 10
     rho: float = 0.1
     rescue: bool = True
-    cold: float = 0.3
+    cold: float = 1.0
 
     def __post_init__(self) -> None:
         """Check every number, because OSQP does not."""
         for name in ("accuracy", "eps", "rho", "cold"):
             require_positive(name, getattr(self, name))
         for name in ("max_iterations", "check_interval"):
-            require_count(name, getattr(self, name))
+            as_count(name, getattr(self, name))
+        require_flags(self, "rescue")
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,11 @@ class Settings:
     def __post_init__(self) -> None:
         """Check every number."""
         require_positive("tolerance", self.tolerance)
-        require_count("max_iterations", self.max_iterations)
-        require_count("sides_interval", self.sides_interval)
+        as_count("max_iterations", self.max_iterations)
+        as_count("sides_interval", self.sides_interval)
+        require_flags(self, "acceleration", "sides")
+        if not isinstance(self.qp, QPSettings):
+            raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
         if self.qp.accuracy > self.tolerance:
             raise BoundsError(
                 "qp.accuracy",
@@ -76,9 +80,8 @@ def require_positive(argument: str, value: float) -> None:
         raise BoundsError(argument, f"{value} is not positive")
 
 
-def require_count(argument: str, value: int) -> None:
-    """Raise unless `value` is a whole number of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise InvalidArgumentError(argument, f"{value!r} is not a whole number")
-    if value < 1:
-        raise BoundsError(argument, f"{value} is less than 1")
+def require_flags(owner: object, *names: str) -> None:
+    """Raise `InvalidArgumentError` unless the named attributes are True or False."""
+    for name in names:
+        if not isinstance(getattr(owner, name), bool):
+            raise InvalidArgumentError(name, f"{getattr(owner, name)!r} is neither True nor False")

@@ -1,5 +1,9 @@
 """The controller: deterministic, without side effects, untouched by bad calls."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from instances import S_REF, instance, obstacle, problem, straight_reference
@@ -8,11 +12,13 @@ from scp_mpc import (
     MPC,
     SCP,
     BoundsError,
+    ConcurrentUseError,
     CovarianceError,
     InvalidArgumentError,
     Margin,
     NotFiniteError,
     ObstaclePrediction,
+    QPSettings,
     Settings,
     ShapeError,
     TooManyObstaclesError,
@@ -64,7 +70,12 @@ def good():
     return {"x0": ref[0], "x_ref": ref, "obstacles": [obstacle(N, (1.5, 0.1))]}
 
 
+ONE = obstacle(N, (1.0, 0.0))
 BAD_STEPS = [
+    ({"x0": np.ma.masked_array(np.zeros(4), [0, 1, 0, 0])}, InvalidArgumentError, "masked"),
+    ({"x0": [1e200, 0, 0, 0]}, BoundsError, "1e\\+200"),
+    ({"obstacles": None}, InvalidArgumentError, "obstacles"),
+    ({"obstacles": ONE}, InvalidArgumentError, "obstacles"),
     ({"x0": np.zeros(3)}, ShapeError, "x0"),
     ({"x0": np.zeros((4, 1))}, ShapeError, "x0"),
     ({"x0": [0, 0, NAN, 0]}, NotFiniteError, "x0"),
@@ -141,6 +152,10 @@ def test_an_obstacle_on_the_robot_gives_finite_inputs(inflation):
     [
         ({"horizon": 0}, BoundsError, "horizon"),
         ({"horizon": 2.5}, InvalidArgumentError, "horizon"),
+        ({"horizon": True}, InvalidArgumentError, "horizon"),
+        ({"margin": 2.4}, InvalidArgumentError, "margin"),
+        ({"inflation": []}, InvalidArgumentError, "inflation"),
+        ({"max_obstacles": 0.0}, InvalidArgumentError, "max_obstacles"),
         ({"Q": [1.0, 1.0]}, ShapeError, "Q"),
         ({"Q": [1.0, -1.0, 1.0, 1.0]}, CovarianceError, "-1"),
         ({"R": [[1.0, 2.0], [0.0, 1.0]]}, CovarianceError, "R"),
@@ -182,11 +197,25 @@ def test_bad_margins_are_refused(values, message):
         {"max_iterations": 0},
         {"max_iterations": True},
         {"sides_interval": -2},
+        {"sides": "no"},
+        {"acceleration": 1},
+        {"qp": None},
     ],
 )
 def test_bad_settings_are_refused(values):
     with pytest.raises(InvalidArgumentError):
         Settings(**values)
+
+
+@pytest.mark.parametrize("values", [{"rescue": "piqp"}, {"cold": 0.0}, {"max_iterations": 0}])
+def test_bad_qp_settings_are_refused(values):
+    with pytest.raises(InvalidArgumentError):
+        QPSettings(**values)
+
+
+def test_settings_of_the_wrong_kind_are_refused():
+    with pytest.raises(InvalidArgumentError, match="settings"):
+        MPC(problem(N), QPSettings())
 
 
 def test_a_bad_guess_is_refused():
@@ -275,3 +304,49 @@ def test_a_plan_cannot_be_edited_into_the_next_step():
     for array in (plan.X, plan.U, plan.s, plan.slack, plan.u0):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 7.0
+
+
+def test_any_iterable_of_obstacles_will_do():
+    step = good()
+    plain = MPC(problem(N)).step(**step)
+    lazy = MPC(problem(N)).step(step["x0"], step["x_ref"], (o for o in step["obstacles"]))
+    np.testing.assert_array_equal(plain.X, lazy.X)
+
+
+def test_problem_takes_numpy_numbers_and_can_be_varied():
+    case = problem(np.int64(N), max_obstacles=np.int32(2))
+    assert (case.horizon, case.max_obstacles) == (N, 2)
+    longer = replace(case, horizon=20)
+    assert longer.horizon == 20
+    np.testing.assert_array_equal(longer.Q, case.Q)
+    assert type(longer.no_go) is type(case.no_go)
+
+
+def test_errors_survive_the_way_out_of_a_process():
+    error = ShapeError("x0", "shape (3,) is not (4,)")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is ShapeError
+    assert str(again) == str(error) == "x0: shape (3,) is not (4,)"
+    assert again.argument == "x0"
+
+
+def test_concurrent_use_of_one_controller_raises():
+    """While a step is under way (here: within a generator of obstacles), another is refused."""
+    mpc = MPC(problem(N))
+    step = good()
+
+    def meddling():
+        with pytest.raises(ConcurrentUseError):
+            mpc.step(**step)
+        yield from step["obstacles"]
+
+    meddled = mpc.step(step["x0"], step["x_ref"], meddling())
+    np.testing.assert_array_equal(meddled.X, MPC(problem(N)).step(**step).X)
+
+
+def test_controllers_in_threads_equal_serial_ones():
+    with ThreadPoolExecutor(2) as pool:
+        threaded = list(pool.map(lambda _: drive(MPC(problem(N)), 12), range(2)))
+    serial = drive(MPC(problem(N)), 12)
+    assert same(threaded[0], serial)
+    assert same(threaded[1], serial)

@@ -227,14 +227,13 @@ def test_what_osqp_does_not_finish_goes_to_the_rescue():
 
 
 def test_a_bad_start_goes_to_the_rescue_first():
-    """The KKT residual of the start, relative to the cost's gradient, decides."""
+    """The KKT residual of the start decides."""
     p = program()
     solver = TrustedSolver(p, QPSettings(cold=0.5))
-    scale = max(1.0, np.abs(p.q).max())
-    for residual, expected in ((0.4 * scale, "osqp"), (0.6 * scale, "piqp"), (0.0, "osqp")):
+    for residual, expected in ((0.4, "osqp"), (0.6, "piqp"), (0.0, "osqp")):
         assert solver.solve(np.zeros(12), np.zeros(20), residual).solver == expected
     alone = TrustedSolver(p, QPSettings(cold=0.5, rescue=False))
-    assert alone.solve(np.zeros(12), np.zeros(20), 9.9 * scale).solver == "osqp"
+    assert alone.solve(np.zeros(12), np.zeros(20), 9.9).solver == "osqp"
 
 
 def test_without_a_rescue_nothing_inaccurate_comes_out():
@@ -255,5 +254,5 @@ def test_residuals_of_a_wrong_sign_are_seen():
         getattr(loose, name)[4] = sign * np.inf
     slack = good.y.copy()
     slack[9] = 1.0  # a free row cannot push
-    assert p.residuals(good.x, slack).complementarity >= 1.0
+    assert p.residuals(good.x, slack).complementarity > 0.05
     assert p.residuals(np.full(12, np.nan), good.y).worst == np.inf

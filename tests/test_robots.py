@@ -39,6 +39,11 @@ def test_state_interleaves_position_and_velocity():
         ({"position": [0]}, InvalidArgumentError),
         ({"position": [0, 0]}, InvalidArgumentError),
         ({"position": [0, 9]}, InvalidArgumentError),
+        ({"position": [0.9, 2.9]}, InvalidArgumentError),
+        ({"position": [False, True]}, InvalidArgumentError),
+        ({"position": None}, InvalidArgumentError),
+        ({"B": np.zeros((4, 0))}, ShapeError),
+        ({"dt": np.nan}, InvalidArgumentError),
     ],
 )
 def test_bad_models_are_refused(changes, error):

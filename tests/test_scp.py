@@ -96,13 +96,13 @@ def test_plans_obey_the_dynamics_the_bounds_and_the_no_go_sets(inflation):
 def test_warm_start_cuts_qp_iterations(monkeypatch):
     """From the shifted plan with its multipliers, OSQP needs a fraction of the cold count."""
     counts = []
-    accept = TrustedSolver._accepts
+    residuals = TrustedSolver._residuals
 
     def counting(self, solution):
         counts.append(solution.iterations)
-        return accept(self, solution)
+        return residuals(self, solution)
 
-    monkeypatch.setattr(TrustedSolver, "_accepts", counting)
+    monkeypatch.setattr(TrustedSolver, "_residuals", counting)
     case = instance("beside", 30, "exact", S_REF, 0)
     settings = Settings(sides=False, qp=QPSettings(max_iterations=20000, rescue=False))
     solver = SCP(case.problem, settings)

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from scp_mpc.arrays import as_count
 from scp_mpc.comparison.attempts import Attempts, rows
 from scp_mpc.comparison.ipopt import Ipopt
 from scp_mpc.comparison.one_thread import in_one_thread
@@ -31,7 +32,7 @@ from scp_mpc.comparison.timing_figure import timing_figure
 from scp_mpc.comparison.timing_table import timing_table
 from scp_mpc.problem import Problem
 from scp_mpc.provenance import provenance
-from scp_mpc.settings import Settings, require_count
+from scp_mpc.settings import Settings
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
 NAME = "horizon_timing"  # of the files
@@ -58,8 +59,8 @@ def measure(
         slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: this many at most.
         advance: Called twice per step, when it is recorded and when it is solved by all.
     """
-    require_count("steps", steps)
-    require_count("slow_steps", slow_steps)
+    as_count("steps", steps)
+    as_count("slow_steps", slow_steps)
     problem = scenario.problem()
     sequence = record(scenario, steps, seed, problem, advance=advance)
     peers = _peers(problem)

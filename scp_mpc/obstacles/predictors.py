@@ -31,7 +31,7 @@ class Predictor(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReportPredictor:
     """The report's predictor: equations (10), (11a) and (11b).
 
@@ -58,7 +58,7 @@ class ReportPredictor:
         Sigma_v = growth * np.array(_FUTURE_VELOCITY_COVARIANCE)
         Sigma_v[0] = self.velocity_covariance
         return ObstaclePrediction(
-            means=_accumulated(position, dt / 2 * (mu_v[1:] + mu_v[:-1])),
+            means=_accumulated(np.asarray(position), dt / 2 * (mu_v[1:] + mu_v[:-1])),
             covariances=_accumulated(
                 self.position_covariance, dt**2 / 4 * (Sigma_v[1:] + Sigma_v[:-1])
             ),
@@ -66,7 +66,7 @@ class ReportPredictor:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConstantVelocityPredictor:
     """A velocity that is constant but unknown: its error grows with time, not with its root.
 
@@ -85,7 +85,7 @@ class ConstantVelocityPredictor:
         """Predict an obstacle in the plane or in space; see the class."""
         t = dt * np.arange(horizon + 1)
         return ObstaclePrediction(
-            means=position + t[:, None] * velocity,
+            means=np.asarray(position) + t[:, None] * np.asarray(velocity),
             covariances=self.position_covariance + (t**2)[:, None, None] * self.velocity_covariance,
             radius=radius,
         )

@@ -20,8 +20,8 @@ class DoubleIntegrator(LinearModel):
 
     def __init__(self, dt: float, dim: int = 2) -> None:
         """Build A and B as block diagonals over the axes."""
-        if dim not in (2, 3):
-            raise InvalidArgumentError("dim", f"{dim} is neither 2 nor 3")
+        if isinstance(dim, float) or dim not in (2, 3):
+            raise InvalidArgumentError("dim", f"{dim!r} is neither 2 nor 3")
         dt = as_number("dt", dt)
         axes: FloatArray = np.eye(dim)
         super().__init__(

@@ -41,15 +41,18 @@ class LinearModel:
         if A.shape[0] != A.shape[1]:
             raise ShapeError("A", f"shape {A.shape} is not square")
         B = as_array("B", self.B, (len(A), -1))
+        if B.shape[1] == 0:
+            raise ShapeError("B", f"shape {B.shape} has no input")
         dt = as_number("dt", self.dt)
         if dt <= 0:
             raise BoundsError("dt", f"{dt} s is not positive")
-        position = np.array(self.position, dtype=np.intp)
-        inside = position.ndim == 1 and set(position.tolist()) <= set(range(len(A)))
-        if not inside or len(position) not in (2, 3) or len(set(position.tolist())) < len(position):
+        position = np.array(self.position)
+        whole = position.dtype.kind in "iu" and position.shape in ((2,), (3,))
+        if not whole or len(set(position.tolist()) & set(range(len(A)))) < len(position):
             raise InvalidArgumentError(
-                "position", f"{self.position} is not 2 or 3 distinct indices below {len(A)}"
+                "position", f"{self.position!r} is not 2 or 3 distinct indices below {len(A)}"
             )
+        position = position.astype(np.intp)
         position.setflags(write=False)
         object.__setattr__(self, "A", frozen(A))
         object.__setattr__(self, "B", frozen(B))

@@ -18,6 +18,8 @@ from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.no_go import NoGoSets
 
+_POINT = 1e-9  # [m] a semi-axis below this is that of a point
+
 
 class Inflation(ABC):
     """A shape for the no-go set: how the s-sigma ellipsoid grows by the radii.
@@ -96,7 +98,7 @@ class AxesInflation(Inflation):
         """See the base class."""
         offsets = positions - sets.means
         y = sets.to_eigenframe(offsets)
-        e = s[:, None, None] * sets.deviations + sets.radii[:, None, None]
+        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
         scale = self._scale(sets)
         w = y / e
         at_centre = np.abs(w).max(axis=-1, keepdims=True) < 1e-12
@@ -119,7 +121,8 @@ class AxesInflation(Inflation):
         return np.where(sets.active[:, None], sd, np.inf)
 
     def _scale(self, sets: NoGoSets) -> FloatArray:
-        return self._reference * sets.deviations.min(axis=-1) + sets.radii[:, None]
+        shortest = self._reference * sets.deviations.min(axis=-1) + sets.radii[:, None]
+        return np.maximum(shortest, _POINT)
 
 
 def _one_stage_earlier(offsets: FloatArray, start: FloatArray) -> FloatArray:

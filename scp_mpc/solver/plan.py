@@ -12,9 +12,9 @@ class Status(Enum):
     """How a plan ended, with the sentence that a log should show."""
 
     CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
-    FEASIBLE = "Iterations ran out; the plan meets every constraint but is not certified optimal."
+    FEASIBLE = "The plan meets every constraint, but the search ended before it was optimal."
     SOFTENED = "No plan nearby meets every constraint; this one violates them least, by its slack."
-    VIOLATING = "Iterations ran out and the plan still enters a no-go set."
+    VIOLATING = "The search ended while the plan still violates a constraint."
     FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
 
     @property

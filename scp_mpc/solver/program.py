@@ -18,10 +18,10 @@ class KKTResiduals:
     """How far a point and its multipliers are from satisfying the KKT conditions.
 
     Attributes:
-        stationarity: Largest entry of |P x + q + A'y|.
+        stationarity: Largest entry of |P x + q + A'y|, relative to that of |P x| if above 1.
         feasibility: Largest violation of lower <= A x <= upper.
-        complementarity: Largest product of a multiplier and the distance to its bound; the
-            multiplier itself where that bound is infinite.
+        complementarity: Largest product of a multiplier and the distance to its bound, relative
+            to the objective if above 1; the multiplier itself where that bound is infinite.
     """
 
     stationarity: float
@@ -60,10 +60,11 @@ class QuadraticProgram:
 
     def residuals(self, x: FloatArray, y: FloatArray) -> KKTResiduals:
         """Return the KKT residuals of the point x (n,) with multipliers y (m,)."""
-        Ax = self.A @ x
-        stationarity = np.abs(self.P @ x + self.q + self._AT @ y).max()
+        Ax, Px = self.A @ x, self.P @ x
+        gradient = np.abs(Px + self.q + self._AT @ y).max() / max(1.0, np.abs(Px).max())
         below, above = Ax - self.lower, self.upper - Ax
         gap = np.where(y < 0, below, above)
         products = np.abs(y) * np.where(np.isinf(gap), 1.0, np.abs(gap))
+        product = products.max() / max(1.0, abs(x @ Px / 2 + self.q @ x))
         violation = -min(below.min(), above.min())
-        return KKTResiduals(float(stationarity), max(0.0, float(violation)), float(products.max()))
+        return KKTResiduals(float(gradient), max(0.0, float(violation)), float(product))

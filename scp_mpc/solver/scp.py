@@ -13,11 +13,13 @@ residual, and a step without an active obstacle takes one QP.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import Lock
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
@@ -69,6 +71,9 @@ class SCP:
         """Lay out the subproblem and set up its solver."""
         self.problem = problem
         self.settings = Settings() if settings is None else settings
+        if not isinstance(self.settings, Settings):
+            raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
+        self._busy = Lock()
         self._subproblem = Subproblem(problem)
         self._qp = TrustedSolver(self._subproblem.program, self.settings.qp)
         self._linearising = self._solving = 0.0
@@ -92,7 +97,23 @@ class SCP:
 
         Raises:
             InvalidArgumentError: Or one of its subclasses, before anything is changed.
+            ConcurrentUseError: Another thread is using this solver.
         """
+        if not self._busy.acquire(blocking=False):
+            raise ConcurrentUseError("this solver is at work in another thread; give each its own")
+        try:
+            return self._solve(x0, x_ref, obstacles, guess, challenge)
+        finally:
+            self._busy.release()
+
+    def _solve(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        guess: Trajectory | Iterate | None,
+        challenge: bool,
+    ) -> Plan:
         began = perf_counter()
         step = StepData.read(self.problem, x0, x_ref, obstacles)
         nominal = None if guess is None else as_iterate(guess, self.problem)

@@ -1,6 +1,6 @@
 """What one control step brings, checked before the solver is touched."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +49,9 @@ class StepData:
         state = as_array("x0", x0, (model.nx,))
         reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
         reference = np.ascontiguousarray(np.broadcast_to(reference, (N + 1, model.nx)))
+        if isinstance(obstacles, ObstaclePrediction) or not isinstance(obstacles, Iterable):
+            raise InvalidArgumentError("obstacles", f"{obstacles!r} is not a list of predictions")
+        obstacles = list(obstacles)
         if len(obstacles) > M:
             raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = {M}")
         for j, obstacle in enumerate(obstacles):

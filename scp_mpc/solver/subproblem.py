@@ -1,11 +1,13 @@
 """The convex subproblem: the only file that knows the order of variables and rows.
 
 Notation:
-    z = [x_1 .. x_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MN]
+    e_i = x_i - xref_i      deviation from the reference, so that no number depends on the origin
+    z = [e_1 .. e_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MN]
     rows = [dynamics | input bounds | bounds on s | half-spaces | slack]
 
-    dynamics        x_{i+1} - A x_i - B u_i = 0
-    half-spaces     normal_ji' p_i + slope_ji s_j + slack_ji >= offset_ji
+    dynamics        e_{i+1} - A e_i - B u_i = A xref_i - xref_{i+1}, with A x_0 for A (e_0 + xref_0)
+    half-spaces     normal_ji' e_i[position] + slope_ji s_j + slack_ji
+                        >= offset_ji - normal_ji' xref_i[position]
     slack           slack = 0 (firm) or slack >= 0 at `slack_weight` per metre (soft)
 
 OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
@@ -47,13 +49,14 @@ class Subproblem:
             self._hessian(), np.zeros(n), A, np.full(m, -np.inf), np.full(m, np.inf)
         )
         lower, upper = self.program.lower, self.program.upper
-        lower[self._dynamics] = upper[self._dynamics] = 0.0
         lower[self._inputs] = np.tile(problem.u_min, N)
         upper[self._inputs] = np.tile(problem.u_max, N)
         lower[self._margin], upper[self._margin] = problem.margin.lower, problem.margin.upper
         lower[self._pins] = 0.0
         self.program.q[self._s] = -2 * problem.margin.weight * problem.margin.reference
         self._x0 = np.zeros(model.nx)
+        self._reference = np.zeros((N, model.nx))
+        self.write_step(self._x0, np.zeros((N + 1, model.nx)))
         self.soft = False
 
     @property
@@ -69,26 +72,26 @@ class Subproblem:
 
     def write_step(self, x0: FloatArray, x_ref: FloatArray) -> None:
         """Write the state x0 (nx,) and the reference x_ref (N+1, nx) of a control step."""
-        problem = self._problem
-        self._x0 = x0
-        rhs = problem.model.A @ x0
-        first = slice(self._dynamics.start, self._dynamics.start + problem.model.nx)
-        self.program.lower[first] = self.program.upper[first] = rhs
-        gradient = -2 * x_ref[1:] @ problem.Q
-        gradient[-1] = -2 * problem.Qf @ x_ref[-1]
-        self.program.q[self._x] = gradient.ravel()
+        self._x0, self._reference = x0, x_ref[1:]
+        before = np.concatenate([x0[None], x_ref[1:-1]])
+        drift = before @ self._problem.model.A.T - x_ref[1:]
+        self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = drift.ravel()
 
     def write_half_spaces(self, spaces: HalfSpaces) -> None:
         """Write normals, slopes and offsets into the rows of the half-spaces."""
         data = self.program.A.data
         data[self._places["normals"]] = spaces.normal.ravel()
         data[self._places["slopes"]] = spaces.slope.ravel()
-        self.program.lower[self._spaces] = spaces.offset.ravel()
+        along = np.einsum(
+            "mnd,nd->mn", spaces.normal, self._reference[:, self._problem.model.position]
+        )
+        self.program.lower[self._spaces] = (spaces.offset - along).ravel()
 
     def pack(self, iterate: Iterate) -> tuple[FloatArray, FloatArray]:
         """Flatten an iterate into z and y; missing multipliers are zero."""
+        deviations = iterate.states[1:] - self._reference
         z = np.concatenate(
-            [iterate.states[1:].ravel(), iterate.inputs.ravel(), iterate.s, iterate.slack.ravel()]
+            [deviations.ravel(), iterate.inputs.ravel(), iterate.s, iterate.slack.ravel()]
         )
         y = np.zeros(len(self.program.lower))
         if iterate.multipliers is not None:
@@ -105,7 +108,7 @@ class Subproblem:
         problem = self._problem
         N, M, model = problem.horizon, problem.max_obstacles, problem.model
         return Iterate(
-            np.concatenate([self._x0[None], z[self._x].reshape(N, model.nx)]),
+            np.concatenate([self._x0[None], self._reference + z[self._x].reshape(N, model.nx)]),
             np.clip(z[self._u].reshape(N, model.nu), problem.u_min, problem.u_max),
             np.clip(z[self._s], problem.margin.lower, problem.margin.upper),
             np.maximum(z[self._slack].reshape(M, N), 0.0),
@@ -136,11 +139,11 @@ class Subproblem:
     def _hessian(self) -> sparse.csc_matrix:
         problem = self._problem
         N, M = problem.horizon, problem.max_obstacles
-        blocks = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
-        blocks += [problem.margin.weight * np.eye(M), sparse.csc_matrix((M * N, M * N))]
-        hessian = sparse.csc_matrix(2 * sparse.block_diag(blocks, format="csc"))
-        hessian.eliminate_zeros()  # a dense block is stored with its zeros, which fill the factors
-        return hessian
+        weights = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
+        blocks = [sparse.csc_matrix(2 * block) for block in weights]  # without the blocks' zeros
+        blocks.append(2 * problem.margin.weight * sparse.eye(M, format="csc"))
+        blocks.append(sparse.csc_matrix((M * N, M * N)))
+        return sparse.csc_matrix(sparse.block_diag(blocks, format="csc"))
 
     def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict[str, IntArray]]:
         problem = self._problem
