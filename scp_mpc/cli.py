@@ -19,7 +19,7 @@ try:
     from tqdm import tqdm
 except ModuleNotFoundError as error:
     raise SystemExit(
-        f"scp-mpc: {error.name} is not installed; try: pip install 'scp-mpc[cli]'"
+        f"scp-mpc: {error.name} is not installed; the command line needs the extra 'cli'"
     ) from None
 
 _ANIMATED = "scenario-4"

@@ -112,14 +112,14 @@ def test_bench_without_a_peer_says_what_to_install(monkeypatch):
     monkeypatch.setattr(horizon_timing, "main", main)
     result = invoke("bench")
     assert result.exit_code == 1
-    assert result.output == ("error: casadi is not installed; try: pip install 'scp-mpc[peers]'\n")
+    assert result.output == ("error: casadi is not installed; it comes with the extra 'peers'\n")
 
 
 @pytest.mark.parametrize("package", ["typer", "rich.console", "tqdm"])
 def test_without_its_extra_the_command_line_says_what_to_install(package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "scp_mpc.cli")
-    with pytest.raises(SystemExit, match=r"pip install 'scp-mpc\[cli\]'"):
+    with pytest.raises(SystemExit, match="the extra 'cli'"):
         importlib.import_module("scp_mpc.cli")
 
 

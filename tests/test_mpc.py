@@ -350,3 +350,13 @@ def test_controllers_in_threads_equal_serial_ones():
     serial = drive(MPC(problem(N)), 12)
     assert same(threaded[0], serial)
     assert same(threaded[1], serial)
+
+
+def test_points_without_extent_have_an_empty_no_go_set():
+    """Zero covariance and zero radii: nothing to keep out of, and nothing to divide by."""
+    for inflation in ("exact", "axes"):
+        ref = straight_reference(N)
+        point = ObstaclePrediction(np.tile([1.5, 0.0], (N + 1, 1)), np.zeros((2, 2)), 0.0)
+        plan = MPC(problem(N, inflation, robot_radius=0.0)).step(ref[0], ref, [point])
+        assert plan.ok, plan.status
+        assert np.isfinite(plan.U).all()

@@ -21,7 +21,7 @@ class PeerMissingError(ScpMpcError, ImportError):
 
     def __init__(self, package: str) -> None:
         """Say what is missing and how to get it."""
-        super().__init__(f"{package} is not installed; try: pip install 'scp-mpc[peers]'")
+        super().__init__(f"{package} is not installed; it comes with the extra 'peers'")
 
 
 @dataclass(frozen=True, eq=False)

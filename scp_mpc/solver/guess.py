@@ -36,4 +36,5 @@ def _check(owner: Iterate | Multipliers, shapes: dict[str, tuple[int, ...]]) -> 
         array = getattr(owner, name)
         if array.shape != shape:
             raise ShapeError(f"guess.{name}", f"shape {array.shape} is not {shape}")
-        require_finite(f"guess.{name}", array)
+        if not np.isfinite(array.sum()):  # the quick way to know that all is well
+            require_finite(f"guess.{name}", array)

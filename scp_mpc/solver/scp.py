@@ -239,13 +239,15 @@ class SCP:
         status: Status,
         iterations: int,
     ) -> Descent:
-        cost, merit = self._cost(step, iterate), self._merit(step, iterate)
+        cost = self._cost(step, iterate)
+        merit = cost + self._penalty(iterate)
         return Descent(iterate.frozen(), cost, merit, residuals, status, iterations)
 
     def _merit(self, step: StepData, iterate: Iterate) -> float:
-        """Cost and the penalty on the slack."""
-        penalty = self.problem.slack_weight * float(iterate.slack.sum())
-        return self._cost(step, iterate) + penalty
+        return self._cost(step, iterate) + self._penalty(iterate)
+
+    def _penalty(self, iterate: Iterate) -> float:
+        return self.problem.slack_weight * float(iterate.slack.sum())
 
     def _cost(self, step: StepData, iterate: Iterate) -> float:
         return self.problem.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)
