@@ -18,7 +18,7 @@ def starts(case, reference, obstacles):
     free = Iterate(reference, np.zeros((N, case.model.nu)), np.full(M, S_REF), np.zeros((M, N)))
     value = step.half_spaces(case, free.states, free.s).value
     position = case.model.position
-    return step, value, candidates(free, reference[:, position], position, step.sets, value)
+    return step, value, candidates(free, position, step.sets, value)
 
 
 def test_planar_candidates_pass_left_and_right():

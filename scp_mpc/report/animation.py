@@ -16,7 +16,7 @@ from scp_mpc.simulation.closed_loop import ClosedLoop
 _DPI = 80
 _FRAMES_PER_SECOND = 10
 _COLORS = 64
-_BEFORE, _AFTER = 28, 36  # control steps around the closest one
+_BEFORE, _AFTER = 28, 20  # control steps around the closest one
 _CLOSE_UP = 4.5  # [m] half the width of the close-up
 
 

@@ -157,7 +157,7 @@ class SCP:
             return best, 0, False
         position = self.problem.model.position
         value = step.half_spaces(self.problem, free.states, free.s).value
-        starts = candidates(free, free.states[:, position], position, step.sets, value)
+        starts = candidates(free, position, step.sets, value)
         incumbent = best
         for start in starts:
             rival = self._descend(step, start, _EXPLORATION)

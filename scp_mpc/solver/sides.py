@@ -6,7 +6,7 @@ would enter a no-go set, it is moved to the boundary point whose normal is squar
 motion. Linearising about it gives half-spaces on that side, sound as any other.
 
 Notation:
-    p       (N+1, d)    positions of the plan that ignores the obstacles, row 0 now
+    p       (N, d)      positions of the plan that ignores the obstacles
     v       (d,)        motion relative to the obstacle over the conflict
     n       (d,)        side: a unit vector square to v
 """
@@ -21,13 +21,12 @@ from scp_mpc.solver.iterate import Iterate
 
 
 def candidates(
-    free: Iterate, positions: FloatArray, position: IntArray, sets: NoGoSets, value: FloatArray
+    free: Iterate, position: IntArray, sets: NoGoSets, value: FloatArray
 ) -> list[Iterate]:
     """Return starts that pass the first conflicting obstacle on its sides; none if none conflicts.
 
     Args:
         free: The plan that ignores the obstacles.
-        positions: (N+1, d) its positions.
         position: (d,) indices of the position within the state.
         sets: The obstacles' ellipsoids.
         value: (M, N) constraint function along `free`; negative means conflict.
@@ -40,12 +39,12 @@ def candidates(
     stages = np.flatnonzero(conflict[j])
     return [
         _moved(free, position, stages, _boundary_points(sets, free.s, j, stages, n))
-        for n in _sides(positions, sets.means[j], stages)
+        for n in _sides(free.states[1:, position], sets.means[j], stages)
     ]
 
 
 def _sides(positions: FloatArray, means: FloatArray, stages: IntArray) -> list[FloatArray]:
-    relative = positions[1:] - means
+    relative = positions - means
     begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(means) - 1)
     v = relative[end] - relative[begin]
     if not v.any():
