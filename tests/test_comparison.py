@@ -155,7 +155,7 @@ def test_exact_in_space_is_refused():
 
 def test_missing_casadi_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(PeerMissingError, match="casadi .* extra 'peers'"):
+    with pytest.raises(PeerMissingError, match=r"casadi .* extra 'peers'"):
         Ipopt(easy()[0])
 
 
