@@ -11,8 +11,8 @@ class QPSettings:
     """Settings of the quadratic program's solvers.
 
     Attributes:
-        accuracy: KKT residual that a QP's solution must reach before it is used; what OSQP does
-            not bring there goes to the rescue solver.
+        accuracy: KKT residual at which a QP counts as solved; what OSQP does not bring there goes
+            to the rescue solver. Where both fall short, a feasible point below 1e-3 is used.
         eps: OSQP's absolute and relative tolerance; polishing takes it from there to `accuracy`.
         max_iterations: OSQP's iterations before the rescue solver is asked.
         check_interval: Iterations between OSQP's checks for termination.
@@ -45,7 +45,8 @@ class Settings:
 
     Attributes:
         tolerance: KKT residual of the original problem at which a plan is certified.
-        max_iterations: Convex subproblems per control step at most.
+        max_iterations: Steps of one descent at most; each solves a convex subproblem, or two where
+            an extrapolation did not help.
         acceleration: Extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.

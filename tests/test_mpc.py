@@ -15,6 +15,7 @@ from scp_mpc import (
     ConcurrentUseError,
     CovarianceError,
     InvalidArgumentError,
+    Iterate,
     Margin,
     NotFiniteError,
     ObstaclePrediction,
@@ -360,3 +361,37 @@ def test_points_without_extent_have_an_empty_no_go_set():
         plan = MPC(problem(N, inflation, robot_radius=0.0)).step(ref[0], ref, [point])
         assert plan.ok, plan.status
         assert np.isfinite(plan.U).all()
+
+
+def test_multipliers_and_guesses_are_safe_from_each_other():
+    """A plan's multipliers are read-only; a caller's guess stays as writable as it was."""
+    case = problem(N)
+    plan = SCP(case).solve(**good())
+    with pytest.raises(ValueError, match="read-only"):
+        plan.multipliers.obstacles[...] = NAN
+    mine = Iterate(*(np.array(a) for a in (plan.X, plan.U, plan.iterate.s, plan.iterate.slack)))
+    before = [a.copy() for a in (mine.states, mine.inputs, mine.s, mine.slack)]
+    step = good()
+    SCP(case).solve(step["x0"], step["x_ref"], step["obstacles"], mine)
+    for array, copy in zip((mine.states, mine.inputs, mine.s, mine.slack), before, strict=True):
+        np.testing.assert_array_equal(array, copy)
+        array[...] = 1.0
+
+
+def test_sides_are_tried_at_first_contact_and_then_at_intervals():
+    """Trailing exactly behind a slow obstacle keeps it in touch with every plan."""
+    case = problem(20)
+    for interval in (1, 3):
+        mpc, tried = MPC(case, Settings(sides_interval=interval)), []
+        for _ in range(2):
+            x = np.array([0.0, 2.0, 0.3, 0.0])
+            for k in range(7):
+                ref = straight_reference(20) + [0.4 * k, 0, 0, 0]
+                blocking = [obstacle(20, (4.0 + 0.06 * k, 0.0), (0.3, 0.0), 0.3 * np.eye(2))]
+                plan = mpc.step(x, ref, blocking)
+                assert plan.iterate.touches
+                tried.append(plan.candidates > 0)
+                x = case.model.step(x, plan.u0)
+            mpc.reset()
+        pattern = [k % interval == 0 for k in range(7)]
+        assert tried == pattern + pattern

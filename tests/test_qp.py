@@ -198,6 +198,20 @@ def test_warm_start_at_the_optimum_cuts_iterations():
     assert warm.iterations <= 10
 
 
+def test_a_warm_start_replaces_what_the_last_program_left_behind():
+    p, other = program(0), program(1)
+    solver = OSQPSolver(p, QPSettings(eps=1e-7, max_iterations=20000))
+    optimum = solved(solver)
+    solver.update(**values(other))
+    solved(solver)
+    solver.update(**values(p))
+    assert solver.solve(optimum.x, optimum.y).iterations <= 10
+    solver.update(**values(other))
+    solved(solver)
+    solver.update(**values(p))
+    assert solver.solve().iterations > 10  # from where the other program ended
+
+
 def test_stdout_stays_clean_where_no_constraint_is_active(capfd):
     """OSQP's polish announces an empty active set on standard output, whatever it is told."""
     n = 4

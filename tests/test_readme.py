@@ -13,7 +13,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 def test_there_is_an_example():
     assert EXAMPLES
     lines = [line for line in EXAMPLES[0].splitlines() if line.strip()]
-    assert len(lines) <= 20
+    assert len(lines) <= 15
 
 
 @pytest.mark.parametrize("example", EXAMPLES)

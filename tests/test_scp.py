@@ -231,3 +231,30 @@ def test_three_dimensions():
     assert plan.ok
     distance = np.linalg.norm(plan.X[1:, [0, 2, 4]] - ball.means[1:], axis=1)
     assert distance.min() == pytest.approx(S_REF * 0.1 + 0.35, abs=1e-6)
+
+
+def test_a_refinement_that_fails_does_not_lose_the_plan_it_should_refine(monkeypatch):
+    """The winner of the exploration stands if refining it breaks down."""
+    case = problem(30, "exact")
+    ref = straight_reference(30, 2.0)
+    slow = [obstacle(30, (3.0, 0.0), (0.3, 0.0))]
+    behind = ref.copy()
+    behind[:, 0] = np.minimum(ref[:, 0], 1.5)
+    guess = Trajectory(behind, np.zeros((30, 2)))
+    plain = SCP(case)
+    expected = plain.solve(ref[0], ref, slow, guess)
+    broken = SCP(case)
+    descend, calls = broken._descend, []
+
+    def breaking(step, nominal, limit):
+        calls.append(limit)
+        if len(calls) == 4:  # the incumbent, two rivals, then the refinement
+            return broken._given_up(step, nominal)
+        return descend(step, nominal, limit)
+
+    monkeypatch.setattr(broken, "_descend", breaking)
+    plan = broken.solve(ref[0], ref, slow, guess)
+    assert expected.switched
+    assert plan.switched
+    assert plan.ok
+    assert plan.cost == pytest.approx(expected.cost, rel=0.05)

@@ -78,4 +78,11 @@ def test_keeping_pace_with_the_obstacle_still_gives_sides(inflation):
     alongside = obstacle(N, (0.1, 0.3), (2.0, 0.0))
     _, _, found = starts(case, ref, [alongside])
     assert len(found) == 2
-    assert all(np.isfinite(start.states).all() for start in found)
+    offsets = [(s.states - ref)[1:, [0, 2]] for s in found]
+    assert all(np.isfinite(offset).all() for offset in offsets)
+    moved = offsets[0].any(axis=1)
+    assert moved.any()
+    # Two sides, opposite to each other and square to the offset (-0.1, -0.3) from the obstacle.
+    across = np.array([-0.3, 0.1]) / np.hypot(0.3, 0.1)
+    sides = [np.sign((offset[moved] @ across).mean()) for offset in offsets]
+    assert sorted(sides) == [-1.0, 1.0]

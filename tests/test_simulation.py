@@ -16,6 +16,14 @@ def test_the_four_scenarios_are_the_reports():
         assert problem.inflation == "axes"
         assert problem.margin.lower == problem.margin.reference
         assert (problem.u_min == -3).all()
+        assert (problem.u_max == 3).all()
+        np.testing.assert_array_equal(problem.Q, np.diag([0.2, 0.05, 0.2, 0.05]))
+        np.testing.assert_array_equal(problem.R, np.diag([0.001, 0.001]))
+        margin = problem.margin
+        assert (margin.reference**2, margin.upper, margin.weight) == pytest.approx(
+            (5.991, 10, 0.005)
+        )
+        assert problem.robot_radius + scenario.obstacle.radius == pytest.approx(0.35)
 
 
 def test_reference_velocity_is_the_derivative_of_its_position():
@@ -58,6 +66,10 @@ def test_the_robot_passes_the_obstacle(inflation):
     assert run.tracking_errors[5] < 0.1
     assert run.states.shape == (61, 4)
     np.testing.assert_allclose(run.times[-1], 12.0)
+    for k in (0, 17, 59):
+        np.testing.assert_array_equal(run.predictions[k].means[0], run.obstacle[k])
+        np.testing.assert_array_equal(run.plans[k].X[0], run.states[k])
+        np.testing.assert_allclose(run.obstacle[k], scenario.obstacle.position(0.2 * k))
 
 
 def test_long_horizon_passes_rather_than_trails():

@@ -13,7 +13,7 @@ class Status(Enum):
 
     CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
     FEASIBLE = "The plan meets every constraint, but the search ended before it was optimal."
-    SOFTENED = "No plan nearby meets every constraint; this one violates them least, by its slack."
+    SOFTENED = "No plan that meets every constraint was found; this one violates them by its slack."
     VIOLATING = "The search ended while the plan still violates a constraint."
     FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
 
@@ -50,7 +50,7 @@ class Plan:
         cost: Value of the objective, slack not included.
         status: How it ended.
         kkt: Residuals of the original problem's KKT conditions at this plan.
-        iterations: Subproblems solved on the way to this plan.
+        iterations: Steps of the descent that led to this plan.
         qps: Quadratic programs in this control step by the solver that finished them.
         candidates: Rival plans on other sides that were tried; `switched` if one of them won.
         timing: Seconds spent.

@@ -37,7 +37,7 @@ class KKTResiduals:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """The program's data. The patterns of P and A are fixed; all values may be rewritten.
+    """The program's data. P and the pattern of A are fixed; all other values may be rewritten.
 
     Attributes:
         P: (n, n) symmetric positive semi-definite, both triangles, CSC.

@@ -12,7 +12,7 @@ residual, and a step without an active obstacle takes one QP.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from time import perf_counter
 
@@ -133,7 +133,7 @@ class SCP:
     def _descend(self, step: StepData, nominal: Iterate, limit: int) -> Descent:
         """Run the loop from one nominal plan, for at most `limit` subproblems."""
         tolerance = self.settings.tolerance
-        self._subproblem.soft = bool(nominal.slack.max(initial=0.0) > tolerance)
+        self._subproblem.soft = False
         iterate, iterations = self._subproblem.started(nominal), 0
         residuals = self._linearise_about(step, iterate)
         acceleration = Anderson(iterate, self.problem.model.position)
@@ -158,14 +158,18 @@ class SCP:
         position = self.problem.model.position
         value = step.half_spaces(self.problem, free.states, free.s).value
         starts = candidates(free, position, step.sets, value)
-        incumbent = best
+        rival: Descent | None = None
         for start in starts:
-            rival = self._descend(step, start, _EXPLORATION)
-            if rival.beats(best, _HYSTERESIS * most):
-                best = rival
-        if best is not incumbent and not best.status.certified:
-            best = self._descend(step, best.iterate, self.settings.max_iterations)
-        return best, len(starts), best is not incumbent
+            other = self._descend(step, start, _EXPLORATION)
+            if rival is None or other.beats(rival, lead=0.0):
+                rival = other
+        if rival is None or not rival.beats(best, _HYSTERESIS * most):
+            return best, len(starts), False
+        if not rival.status.certified:
+            refined = self._descend(step, rival.iterate, self.settings.max_iterations)
+            refined = replace(refined, iterations=rival.iterations + refined.iterations)
+            rival = rival if rival.beats(refined, lead=0.0) else refined
+        return rival, len(starts), True
 
     def _improve(
         self, step: StepData, iterate: Iterate, residuals: KKTResiduals, acceleration: Anderson

@@ -2,8 +2,8 @@
 
 One linearisation keeps to one side; a plan that trails behind an obstacle is a local optimum. A
 candidate is a path that need not obey the dynamics: where the plan that ignores the obstacles
-would enter a no-go set, it is moved to the boundary point whose normal is square to the relative
-motion. Linearising about it gives half-spaces on that side, sound as any other.
+would enter a no-go set, it is moved to the point of the exact inflation's boundary whose normal is
+square to the relative motion. Linearising about it gives half-spaces on that side, sound as any.
 
 Notation:
     p       (N, d)      positions of the plan that ignores the obstacles
@@ -57,7 +57,7 @@ def _sides(positions: FloatArray, means: FloatArray, stages: IntArray) -> list[F
 def _boundary_points(
     sets: NoGoSets, s: FloatArray, j: int, stages: IntArray, n: FloatArray
 ) -> FloatArray:
-    """Points of the no-go sets' boundary with outward normal n: mu + s Sigma n / |.| + r n."""
+    """Boundary points of ellipsoid (+) ball with outward normal n: mu + s Sigma n / |.| + r n."""
     rotation, deviation = sets.rotations[j, stages], sets.deviations[j, stages]
     local = np.einsum("kji,j->ki", rotation, n)
     half_width = np.sqrt(np.square(deviation * local).sum(axis=-1, keepdims=True))

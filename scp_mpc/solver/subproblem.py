@@ -107,6 +107,7 @@ class Subproblem:
         """Name the parts of z and y; inputs and sizes are clipped to their bounds."""
         problem = self._problem
         N, M, model = problem.horizon, problem.max_obstacles, problem.model
+        y.setflags(write=False)
         return Iterate(
             np.concatenate([self._x0[None], self._reference + z[self._x].reshape(N, model.nx)]),
             np.clip(z[self._u].reshape(N, model.nu), problem.u_min, problem.u_max),
@@ -126,8 +127,14 @@ class Subproblem:
         return self.program.residuals(*self.pack(iterate))
 
     def started(self, iterate: Iterate) -> Iterate:
-        """The iterate with the state of this control step in row 0."""
-        return replace(iterate, states=np.concatenate([self._x0[None], iterate.states[1:]]))
+        """A copy of the iterate with the state of this control step in row 0."""
+        return replace(
+            iterate,
+            states=np.concatenate([self._x0[None], iterate.states[1:]]),
+            inputs=iterate.inputs.copy(),
+            s=iterate.s.copy(),
+            slack=iterate.slack.copy(),
+        )
 
     def resting(self, states: FloatArray) -> Iterate:
         """An iterate with the given states (N+1, nx), no input, s = s_ref and no slack."""
