@@ -13,6 +13,7 @@ from scp_mpc.comparison.horizon_timing import NAME, SLOW_STEPS, main
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
+    parser.add_argument("--json", type=Path, help="file for the numbers; default: in --out")
     parser.add_argument("--steps", type=int, default=200, help="control steps per horizon")
     parser.add_argument("--seed", type=int, default=0, help="seed of the disturbance")
     parser.add_argument(
@@ -20,7 +21,7 @@ if __name__ == "__main__":
     )
     arguments = parser.parse_args()
     main(
-        arguments.out / f"{NAME}.json",
+        arguments.json or arguments.out / f"{NAME}.json",
         arguments.out,
         arguments.steps,
         arguments.seed,

@@ -25,7 +25,7 @@ class QPSettings:
     accuracy: float = 1e-7
     eps: float = 1e-4
     max_iterations: int = 150
-    check_interval: int = 10
+    check_interval: int = 5
     rho: float = 0.1
     rescue: bool = True
     cold: float = 1.0

@@ -92,6 +92,7 @@ class OSQPSolver:
             eps_rel=settings.eps,
             eps_prim_inf=1e-9,  # the default calls feasible programs infeasible
             eps_dual_inf=1e-9,
+            scaling=2,  # every pass costs at every update; ten make no program easier here
             max_iter=settings.max_iterations,
             check_termination=settings.check_interval,
         )
