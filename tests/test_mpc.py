@@ -1,51 +1,23 @@
-"""The controller: deterministic, without side effects, untouched by bad calls."""
+"""The controller: deterministic, without side effects, one thread at a time."""
 
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from instances import S_REF, instance, obstacle, problem, straight_reference
+from driving import N, drive, good, same
+from instances import obstacle, problem, straight_reference
 
 from scp_mpc import (
     MPC,
     SCP,
-    BoundsError,
     ConcurrentUseError,
-    CovarianceError,
-    InvalidArgumentError,
     Iterate,
-    Margin,
-    NotFiniteError,
     ObstaclePrediction,
-    QPSettings,
     Settings,
-    ShapeError,
-    TooManyObstaclesError,
-    Trajectory,
 )
 
-N = 8
 NAN, INF = np.nan, np.inf
-
-
-def drive(mpc, steps, disturb=lambda _: None):
-    """Drive along the x-axis past a slow obstacle; return the plans."""
-    x, plans = np.array([0.0, 2.0, 0.05, 0.0]), []
-    for k in range(steps):
-        disturb(k)
-        ref = straight_reference(N) + [0.4 * k, 0, 0, 0]
-        plans.append(mpc.step(x, ref, [obstacle(N, (3.0 + 0.06 * k, 0.0), (0.3, 0.0))]))
-        x = mpc.problem.model.step(x, plans[-1].u0)
-    return plans
-
-
-def same(first, second):
-    return all(
-        np.array_equal(a.X, b.X) and np.array_equal(a.U, b.U) and a.cost == b.cost
-        for a, b in zip(first, second, strict=True)
-    )
 
 
 def test_same_steps_same_bits():
@@ -64,66 +36,6 @@ def test_two_controllers_do_not_know_of_each_other():
     other = MPC(problem(N))
     together = drive(MPC(problem(N)), 6, lambda _: drive(other, 2))
     assert same(alone, together)
-
-
-def good():
-    ref = straight_reference(N)
-    return {"x0": ref[0], "x_ref": ref, "obstacles": [obstacle(N, (1.5, 0.1))]}
-
-
-ONE = obstacle(N, (1.0, 0.0))
-BAD_STEPS = [
-    ({"x0": np.ma.masked_array(np.zeros(4), [0, 1, 0, 0])}, InvalidArgumentError, "masked"),
-    ({"x0": [1e200, 0, 0, 0]}, BoundsError, "1e\\+200"),
-    ({"obstacles": None}, InvalidArgumentError, "obstacles"),
-    ({"obstacles": ONE}, InvalidArgumentError, "obstacles"),
-    ({"x0": np.zeros(3)}, ShapeError, "x0"),
-    ({"x0": np.zeros((4, 1))}, ShapeError, "x0"),
-    ({"x0": [0, 0, NAN, 0]}, NotFiniteError, "x0"),
-    ({"x0": [0, INF, 0, 0]}, NotFiniteError, "x0"),
-    ({"x0": "somewhere"}, InvalidArgumentError, "x0"),
-    ({"x0": [1j, 0, 0, 0]}, InvalidArgumentError, "x0"),
-    ({"x0": None}, InvalidArgumentError, "x0"),
-    ({"x_ref": np.zeros((N, 4))}, ShapeError, "x_ref"),
-    ({"x_ref": np.zeros((N + 1, 2))}, ShapeError, "x_ref"),
-    ({"x_ref": np.full((N + 1, 4), NAN)}, NotFiniteError, "x_ref"),
-    ({"obstacles": [obstacle(N, (1, 0))] * 2}, TooManyObstaclesError, "max_obstacles = 1"),
-    ({"obstacles": [obstacle(N + 1, (1, 0))]}, ShapeError, "obstacles"),
-    ({"obstacles": [np.zeros((N + 1, 2))]}, InvalidArgumentError, "obstacles"),
-]
-
-
-@pytest.mark.parametrize(("change", "error", "message"), BAD_STEPS)
-def test_a_bad_step_is_refused_and_leaves_no_trace(change, error, message):
-    mpc = MPC(problem(N))
-
-    def interrupt(k):
-        if k % 3 == 1:
-            with pytest.raises(error, match=message):
-                mpc.step(**{**good(), **change})
-
-    assert same(drive(MPC(problem(N)), 9), drive(mpc, 9, interrupt))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ((np.zeros((5, 2)), np.eye(3), 0.2), ShapeError, "covariances"),
-        ((np.zeros((5, 2)), np.zeros((4, 2, 2)), 0.2), ShapeError, "covariances"),
-        ((np.zeros((5, 4)), np.eye(4), 0.2), ShapeError, "means"),
-        ((np.zeros((1, 2)), np.eye(2), 0.2), ShapeError, "1 row"),
-        ((np.full((5, 2), NAN), np.eye(2), 0.2), NotFiniteError, "means"),
-        ((np.zeros((5, 2)), [[INF, 0], [0, 1]], 0.2), NotFiniteError, "covariances"),
-        ((np.zeros((5, 2)), [[1.0, 0.5], [0.4, 1.0]], 0.2), CovarianceError, "not symmetric"),
-        # The report's own velocity covariance: determinant -1e-4.
-        ((np.zeros((5, 2)), [[0.08, 0.05], [0.05, 0.03]], 0.2), CovarianceError, "-0.00"),
-        ((np.zeros((5, 2)), np.eye(2), -0.1), BoundsError, "-0.1 m"),
-        ((np.zeros((5, 2)), np.eye(2), NAN), NotFiniteError, "radius"),
-    ],
-)
-def test_bad_predictions_are_refused(arguments, error, message):
-    with pytest.raises(error, match=message):
-        ObstaclePrediction(*arguments)
 
 
 @pytest.mark.parametrize(
@@ -146,93 +58,6 @@ def test_an_obstacle_on_the_robot_gives_finite_inputs(inflation):
     assert np.isfinite(plan.U).all()
     assert (np.abs(plan.U) <= 3.0).all()
     assert not plan.ok
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"horizon": 0}, BoundsError, "horizon"),
-        ({"horizon": 2.5}, InvalidArgumentError, "horizon"),
-        ({"horizon": True}, InvalidArgumentError, "horizon"),
-        ({"margin": 2.4}, InvalidArgumentError, "margin"),
-        ({"inflation": []}, InvalidArgumentError, "inflation"),
-        ({"max_obstacles": 0.0}, InvalidArgumentError, "max_obstacles"),
-        ({"Q": [1.0, 1.0]}, ShapeError, "Q"),
-        ({"Q": [1.0, -1.0, 1.0, 1.0]}, CovarianceError, "-1"),
-        ({"R": [[1.0, 2.0], [0.0, 1.0]]}, CovarianceError, "R"),
-        ({"u_min": 3.0, "u_max": -3.0}, BoundsError, "3.0 exceeds u_max = -3.0"),
-        ({"u_min": [0.0, NAN]}, NotFiniteError, "u_min"),
-        ({"robot_radius": -0.15}, BoundsError, "-0.15"),
-        ({"inflation": "square"}, InvalidArgumentError, "square"),
-        ({"max_obstacles": -1}, BoundsError, "-1"),
-        ({"slack_weight": 0.0}, BoundsError, "slack_weight"),
-        ({"model": "car"}, InvalidArgumentError, "car"),
-    ],
-)
-def test_bad_problems_are_refused(changes, error, message):
-    with pytest.raises(error, match=message):
-        problem(**{"horizon": N, **changes})
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"lower": 3.0, "upper": 2.0}, "margin.lower"),
-        ({"lower": -1.0}, "margin.lower"),
-        ({"reference": 11.0}, "11.0"),
-        ({"weight": 0.0}, "weight"),
-        ({"upper": NAN}, "margin.upper"),
-    ],
-)
-def test_bad_margins_are_refused(values, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        Margin(**values)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"tolerance": 0.0},
-        {"tolerance": NAN},
-        {"tolerance": 1e-9},  # finer than what the quadratic programs deliver
-        {"max_iterations": 0},
-        {"max_iterations": True},
-        {"sides_interval": -2},
-        {"sides": "no"},
-        {"acceleration": 1},
-        {"qp": None},
-    ],
-)
-def test_bad_settings_are_refused(values):
-    with pytest.raises(InvalidArgumentError):
-        Settings(**values)
-
-
-@pytest.mark.parametrize("values", [{"rescue": "piqp"}, {"cold": 0.0}, {"max_iterations": 0}])
-def test_bad_qp_settings_are_refused(values):
-    with pytest.raises(InvalidArgumentError):
-        QPSettings(**values)
-
-
-def test_settings_of_the_wrong_kind_are_refused():
-    with pytest.raises(InvalidArgumentError, match="settings"):
-        MPC(problem(N), QPSettings())
-
-
-def test_a_bad_guess_is_refused():
-    case = instance("ahead", N, "exact", S_REF, 0)
-    solver = SCP(case.problem)
-    arguments = (case.x0, case.x_ref, case.obstacles)
-    for guess, error in (
-        (Trajectory(np.zeros((4, 4)), np.zeros((3, 2))), ShapeError),
-        ("straight on", InvalidArgumentError),
-    ):
-        with pytest.raises(error, match="guess"):
-            solver.solve(*arguments, guess)
-    with pytest.raises(ShapeError, match="states"):
-        Trajectory(np.zeros((4, 4)), np.zeros((4, 2)))
-    with pytest.raises(NotFiniteError, match="inputs"):
-        Trajectory(np.zeros((4, 4)), np.full((3, 2), NAN))
 
 
 def test_arguments_are_never_written_to():
@@ -321,14 +146,6 @@ def test_problem_takes_numpy_numbers_and_can_be_varied():
     assert longer.horizon == 20
     np.testing.assert_array_equal(longer.Q, case.Q)
     assert type(longer.no_go) is type(case.no_go)
-
-
-def test_errors_survive_the_way_out_of_a_process():
-    error = ShapeError("x0", "shape (3,) is not (4,)")
-    again = pickle.loads(pickle.dumps(error))
-    assert type(again) is ShapeError
-    assert str(again) == str(error) == "x0: shape (3,) is not (4,)"
-    assert again.argument == "x0"
 
 
 def test_concurrent_use_of_one_controller_raises():
