@@ -19,6 +19,9 @@ _TWO_PI = 2 * np.pi
 class Verdict:
     """What IPOPT found."""
 
+    X: np.ndarray
+    U: np.ndarray
+    s: float
     cost: float
     ok: bool
 
@@ -147,7 +150,12 @@ class Referee:
             lbg=np.zeros(self.size_x + N),
             ubg=np.concatenate([np.zeros(self.size_x), np.full(N, np.inf)]),
         )
-        return Verdict(float(result["f"]), bool(solver.stats()["success"]))
+        w = np.array(result["x"]).ravel()
+        ends = w[: self.size_x].reshape(N, -1)
+        inputs = w[self.size_x : self.size_x + self.size_u].reshape(N, -1)
+        size = float(w[self.size_x + self.size_u])
+        ok = bool(solver.stats()["success"])
+        return Verdict(np.vstack([X[:1], ends]), inputs, size, float(result["f"]), ok)
 
     def _row_scale(self) -> np.ndarray:
         """The package measures the `axes` constraint in metres: times the short semi-axis."""

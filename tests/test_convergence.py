@@ -15,8 +15,12 @@ INSTANCES = [
         KINDS, (8, 20, 30), ("exact", "axes"), (S_REF, 0.5), (0, 1)
     )
 ]
-SMALLEST_COST = 1e-3  # below it, 1e-5 is less than IPOPT's own tolerance
 OTHER_OPTIMA = 2  # of 96 that may end in another local optimum than IPOPT from the same guess
+
+
+def refined(referee, far):
+    """Run IPOPT again from where it ended: its barrier leaves small costs a few 1e-5 off."""
+    return referee.solve(far.X, far.U, far.s, near=True) if far.ok else far
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,7 @@ def outcomes():
             plan,
             referee.kkt(plan),
             referee.solve(plan.X, plan.U, float(plan.s[0]), near=True),
-            referee.solve(guess.states, guess.inputs, S_REF, near=False),
+            refined(referee, referee.solve(guess.states, guess.inputs, S_REF, near=False)),
         )
     return rows
 
@@ -62,7 +66,7 @@ def test_ipopt_cannot_improve_on_our_point(outcomes, name):
 
 def test_same_cost_from_the_same_guess_up_to_other_local_optima(outcomes):
     gaps = {
-        name: abs(plan.cost - far.cost) / max(plan.cost, SMALLEST_COST)
+        name: abs(plan.cost - far.cost) / plan.cost
         for name, (plan, _, _, far) in outcomes.items()
         if far.ok
     }
