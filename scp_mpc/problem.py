@@ -9,7 +9,7 @@
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given.
 """
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -80,7 +80,6 @@ class Problem:
     """
 
     model: LinearModel
-    _: KW_ONLY
     horizon: int
     Q: FloatArray
     R: FloatArray

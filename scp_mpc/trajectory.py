@@ -1,4 +1,4 @@
-"""The state and input trajectory of a plan, and its shift by one step.
+"""A state and input trajectory, and the one that inputs lead to.
 
 Notation:
     X   (N+1, nx)   states x_0 .. x_N
@@ -37,18 +37,6 @@ class Trajectory:
                 "states",
                 f"{len(self.states)} states do not belong to {len(self.inputs)} inputs",
             )
-
-    @property
-    def horizon(self) -> int:
-        """Number of intervals N."""
-        return len(self.inputs)
-
-    def shifted(self, step: Callable[[FloatArray, FloatArray], FloatArray]) -> "Trajectory":
-        """Return the trajectory one step later: x_1 .. x_N, f(x_N, u_{N-1}), last input held."""
-        last = step(self.states[-1], self.inputs[-1])
-        return Trajectory(
-            np.vstack([self.states[1:], last]), np.vstack([self.inputs[1:], self.inputs[-1:]])
-        )
 
 
 def rollout(

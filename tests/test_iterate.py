@@ -56,14 +56,6 @@ def test_the_shifted_rest_of_a_plan_obeys_the_dynamics():
     np.testing.assert_array_equal(nominal.states[0], plan.X[1])
 
 
-def test_a_trajectory_shifts_the_same_way(iterate):
-    model = DoubleIntegrator(0.2)
-    later = Trajectory(iterate.states, iterate.inputs).shifted(model.step)
-    np.testing.assert_array_equal(later.states, iterate.shifted(model).states)
-    np.testing.assert_array_equal(later.inputs, iterate.shifted(model).inputs)
-    assert later.horizon == N
-
-
 def test_rollout_applies_the_inputs():
     path = rollout(DoubleIntegrator(0.5).step, np.zeros(4), [[1.0, 0.0], [-1.0, 2.0]])
     np.testing.assert_allclose(path.states[-1], [0.25, 0.0, 0.25, 1.0])

@@ -86,3 +86,16 @@ def test_keeping_pace_with_the_obstacle_still_gives_sides(inflation):
     across = np.array([-0.3, 0.1]) / np.hypot(0.3, 0.1)
     sides = [np.sign((offset[moved] @ across).mean()) for offset in offsets]
     assert sorted(sides) == [-1.0, 1.0]
+
+
+def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
+    """At p = mu the offset now, p_0 - mu_0, decides: it points from the obstacle to the robot."""
+    case, ref = problem(N, "exact"), straight_reference(N)
+    x0 = ref[0] + [0.0, 0.0, 0.4, 0.0]
+    centre = ObstaclePrediction(ref[:, [0, 2]] + [0.1, 0.0], 0.04 * np.eye(2), 0.2)
+    step = StepData.read(case, x0, ref, [centre])
+    np.testing.assert_allclose(step.start, [[-0.1, 0.4]])
+    on_top = ref.copy()
+    on_top[1:, [0, 2]] = centre.means[1:]
+    normal = step.half_spaces(case, on_top, np.array([S_REF])).normal[0, 0]
+    assert normal @ step.start[0] > 0

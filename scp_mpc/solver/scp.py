@@ -185,7 +185,7 @@ class SCP:
             self._write_half_spaces(step, iterate)
         convex = self._solve_convex(iterate, residuals)
         if convex is None and not self._subproblem.soft:
-            self._subproblem.soft = True  # no plan meets all the half-spaces
+            self._subproblem.soft = True  # nobody found a plan within all half-spaces
             convex = self._solve_convex(iterate, residuals)
         return convex
 
