@@ -1,5 +1,6 @@
 """The sequential convex programming: optimal, feasible at every iterate, warm, and honest."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,8 @@ from scp_mpc import (
     Trajectory,
 )
 from scp_mpc.solver import KKTResiduals
+from scp_mpc.solver.acceleration import Anderson
+from scp_mpc.solver.scp import Descent
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.trusted import TrustedSolver
 
@@ -258,3 +261,41 @@ def test_a_refinement_that_fails_does_not_lose_the_plan_it_should_refine(monkeyp
     assert plan.switched
     assert plan.ok
     assert plan.cost == pytest.approx(expected.cost, rel=0.05)
+
+
+def test_a_rival_must_lead_and_safety_comes_first():
+    def end(merit, status=Status.CONVERGED):
+        return Descent(None, merit, merit, KKTResiduals(0.0, 0.0, 0.0), status, 1)
+
+    assert end(0.8).beats(end(1.0), lead=0.1)
+    assert not end(0.95).beats(end(1.0), lead=0.1)
+    assert end(9.0, Status.FEASIBLE).beats(end(1.0, Status.SOFTENED), lead=5.0)
+    assert not end(0.1, Status.SOFTENED).beats(end(9.0), lead=0.0)
+
+
+def test_an_extrapolation_that_costs_more_is_taken_back(monkeypatch):
+    """A proposal a metre off the mark: the plan must be as good as without any."""
+    case = instance("ahead", 20, "exact", S_REF, 0)
+    plain = SCP(case.problem, Settings(sides=False, acceleration=False, max_iterations=300))
+    guess = Trajectory(case.x_ref, np.zeros((20, 2)))
+    expected = plain.solve(case.x0, case.x_ref, case.obstacles, guess)
+    rejected, reject = [], Anderson.reject
+
+    def astray(self, iterate):
+        if self._next is None:
+            return None
+        states = iterate.states.copy()
+        states[1:, 2] += 1.0
+        return replace(iterate, states=states)
+
+    def counting(self):
+        rejected.append(1)
+        reject(self)
+
+    monkeypatch.setattr(Anderson, "propose", astray)
+    monkeypatch.setattr(Anderson, "reject", counting)
+    bold = SCP(case.problem, Settings(sides=False, max_iterations=300))
+    plan = bold.solve(case.x0, case.x_ref, case.obstacles, guess)
+    assert rejected
+    assert plan.status is Status.CONVERGED
+    assert plan.cost == pytest.approx(expected.cost, rel=1e-6)
