@@ -107,8 +107,8 @@ def as_weight(argument: str, value: ArrayLike, size: int) -> FloatArray:
     return frozen(np.ascontiguousarray(matrix))
 
 
-def require_positive_semidefinite(argument: str, matrices: FloatArray) -> None:
-    """Check a stack (n, d, d) of symmetric positive semi-definite matrices.
+def require_positive_semidefinite(argument: str, matrices: FloatArray) -> FloatArray:
+    """Check a stack (n, d, d) of symmetric matrices; return their eigenvalues (n, d), ascending.
 
     Asymmetry and negative eigenvalues are forgiven up to 1e-9 of the largest entry: that much is
     rounding in a product such as J Sigma J'.
@@ -121,13 +121,15 @@ def require_positive_semidefinite(argument: str, matrices: FloatArray) -> None:
     if (asymmetry > allowed).any():
         at = int(np.argmax(asymmetry > allowed))
         raise CovarianceError(argument, f"matrix {at} is not symmetric (by {asymmetry[at]:.3g})")
-    smallest = np.linalg.eigvalsh(matrices)[..., 0]
+    eigenvalues: FloatArray = np.linalg.eigvalsh(matrices)
+    smallest = eigenvalues[..., 0]
     if (smallest < -allowed).any():
         at = int(np.argmax(smallest < -allowed))
         raise CovarianceError(
             argument,
             f"matrix {at} is not positive semi-definite (smallest eigenvalue {smallest[at]:.3g})",
         )
+    return eigenvalues
 
 
 def _fits(shape: Sequence[int], wanted: Sequence[int]) -> bool:

@@ -47,7 +47,9 @@ class Settings:
         tolerance: KKT residual of the original problem at which a plan is certified.
         max_iterations: Steps of one descent at most; each solves a convex subproblem, or two where
             an extrapolation did not help.
-        acceleration: Extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
+        condense: Eliminate the dynamics and solve small dense programs with an active-set method;
+            else, and where that has no answer, sparse programs go to OSQP first.
+        acceleration: On the sparse programs, extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
         qp: Settings of the quadratic program's solvers.
@@ -55,6 +57,7 @@ class Settings:
 
     tolerance: float = 1e-6
     max_iterations: int = 40
+    condense: bool = True
     acceleration: bool = True
     sides: bool = True
     sides_interval: int = 2
@@ -65,7 +68,7 @@ class Settings:
         require_positive("tolerance", self.tolerance)
         as_count("max_iterations", self.max_iterations)
         as_count("sides_interval", self.sides_interval)
-        require_flags(self, "acceleration", "sides")
+        require_flags(self, "condense", "acceleration", "sides")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
         if self.qp.accuracy > self.tolerance:

@@ -93,7 +93,7 @@ class Slsqp:
         X, _, s = self._unknowns.unpack(z, step.x0)
         sets = step.sets
         if self.problem.inflation == "exact":
-            return step.half_spaces(self.problem, X, s).value[: step.count].ravel()
+            return step.half_spaces(X, s).value[: step.count].ravel()
         y = sets.to_eigenframe(X[1:, self.problem.model.position] - sets.means)
         w = y / (s[:, None, None] * sets.deviations + sets.radii[:, None, None])
         return (np.square(w).sum(axis=-1) - 1)[: step.count].ravel()

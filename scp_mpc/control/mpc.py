@@ -38,7 +38,7 @@ class MPC:
 
     def nominal(self) -> Iterate | None:
         """The guess from which the next step starts; None before the first step."""
-        return None if self._last is None else self._last.shifted(self.problem.model)
+        return None if self._last is None else self._shifted()
 
     def step(
         self,
@@ -57,10 +57,15 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
         """
         challenge = self._steps_touching % self.settings.sides_interval == 0
-        plan = self._solver.solve(x0, x_ref, obstacles, self.nominal(), challenge)
+        shifted = None if self._last is None else self._shifted
+        plan = self._solver.solve_from(x0, x_ref, obstacles, shifted, challenge)
         self._last = plan.iterate
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
         return plan
+
+    def _shifted(self) -> Iterate:
+        assert self._last is not None
+        return self._last.shifted(self.problem.model)
 
     def reset(self) -> None:
         """Forget the last plan: the next step is bit for bit that of a new controller."""

@@ -26,6 +26,9 @@ class ObstaclePrediction:
         covariances: (N+1, d, d) position covariances [m^2], or one (d, d) for all rows.
         radius: Radius of the obstacle [m].
 
+    Attributes:
+        spread: (N+1,) largest standard deviation in any direction [m].
+
     Raises:
         ShapeError: The shapes do not belong together.
         NotFiniteError: NaN or infinity.
@@ -36,6 +39,7 @@ class ObstaclePrediction:
     means: FloatArray
     covariances: FloatArray
     radius: float
+    spread: FloatArray
 
     def __init__(self, means: ArrayLike, covariances: ArrayLike, radius: float) -> None:
         """Copy, check and freeze."""
@@ -46,13 +50,15 @@ class ObstaclePrediction:
         Sigma = as_array("covariances", covariances, (rows, dim, dim), (dim, dim))
         if Sigma.ndim == 2:
             Sigma = np.repeat(Sigma[None], rows, axis=0)
-        require_positive_semidefinite("covariances", Sigma)
+        variances = require_positive_semidefinite("covariances", Sigma)
         radius = as_number("radius", radius)
         if radius < 0:
             raise BoundsError("radius", f"{radius} m is negative")
         object.__setattr__(self, "means", frozen(mu))
         object.__setattr__(self, "covariances", frozen(Sigma))
         object.__setattr__(self, "radius", radius)
+        spread = np.sqrt(np.maximum(variances[:, -1], 0.0))
+        object.__setattr__(self, "spread", frozen(spread))
 
     @property
     def horizon(self) -> int:

@@ -87,7 +87,7 @@ def active_half_planes(run: ClosedLoop, k: int) -> list[FloatArray]:
     if plan.multipliers is None:
         return []
     step = StepData.read(problem, run.states[k], run.scenario.states(k), [run.predictions[k]])
-    spaces = step.half_spaces(problem, plan.X, plan.iterate.s)
+    spaces = step.half_spaces(plan.X, plan.iterate.s)
     positions = plan.X[1:, problem.model.position]
     residual = spaces.residual(positions, plan.iterate.s)[0]
     strips = []

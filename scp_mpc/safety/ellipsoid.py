@@ -14,16 +14,22 @@ Sorensen, 1983), 1/|w(t)| is concave and almost linear, so that Newton's method 
 converges monotonically from the left, in a handful of steps. Inside and outside are one case.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
 
+Side = Callable[[], FloatArray]
+
 _MAX_NEWTON = 30
+_CLOSE = 1e-8  # |w|^2 - 1 from which one more step of Newton's method reaches rounding
 _TINY = 1e-13  # relative; below it a coordinate or semi-axis counts as zero
+_LEAST = float(np.finfo(np.float64).tiny) ** 0.25
 
 
 def signed_distance(
-    y: FloatArray, semi_axes: FloatArray, side: FloatArray | None = None
+    y: FloatArray, semi_axes: FloatArray, side: Side | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return the signed distance (...) and the unit outward normal (..., d).
 
@@ -33,37 +39,40 @@ def signed_distance(
     Args:
         y: (..., d) points in the frame of the ellipsoid's axes [m].
         semi_axes: (..., d) non-negative semi-axes [m].
-        side: (..., d) vectors in the same frame; None stands for the positive orthant.
+        side: Returns (..., d) vectors in the same frame, asked for only where it matters; None
+            stands for the positive orthant.
 
     Returns:
         The signed distances and the normals. n'y - |diag(e) n| underestimates the signed distance
         for any unit n, so that whatever rounding does to n errs on the safe side.
     """
-    size = np.abs(y).max(axis=-1, keepdims=True) + semi_axes.max(axis=-1, keepdims=True)
-    tiny = np.maximum(_TINY * size, np.finfo(np.float64).tiny ** 0.25)
+    tiny = max(_TINY * float(np.abs(y).max(initial=0.0) + semi_axes.max(initial=0.0)), _LEAST)
     e = np.maximum(semi_axes, tiny)
     z = _off_the_medial_axis(y, tiny, side)
     e2 = e * e
     least = e2.min(axis=-1, keepdims=True)
     gap = e2 - least  # tau = t + least keeps the smallest denominator free of cancellation
     ez = e * np.abs(z)
+    ez2 = ez * ez
     tau = (ez - gap).max(axis=-1, keepdims=True)
     for _ in range(_MAX_NEWTON):
         denominator = tau + gap
-        w = ez / denominator
-        w2 = w * w
-        norm2 = w2.sum(axis=-1, keepdims=True)
-        norm = np.sqrt(norm2)
-        if norm.max(initial=1.0) < 1 + 1e-14:
+        w2 = ez2 / (denominator * denominator)
+        norm2 = np.add.reduce(w2, axis=-1, keepdims=True)
+        descent = np.add.reduce(w2 / denominator, axis=-1, keepdims=True)
+        tau = tau + (np.sqrt(norm2) - 1) * norm2 / descent
+        if norm2.max(initial=1.0) < 1 + _CLOSE:
             break
-        tau = tau + (norm - 1) * norm2 / (w2 / denominator).sum(axis=-1, keepdims=True)
     n = z / (tau + gap)
-    n /= np.sqrt((n * n).sum(axis=-1, keepdims=True))
+    n /= np.sqrt(np.add.reduce(n * n, axis=-1, keepdims=True))
     en = semi_axes * n
-    return (n * y).sum(axis=-1) - np.sqrt((en * en).sum(axis=-1)), n
+    return np.add.reduce(n * y, axis=-1) - np.sqrt(np.add.reduce(en * en, axis=-1)), n
 
 
-def _off_the_medial_axis(y: FloatArray, tiny: FloatArray, side: FloatArray | None) -> FloatArray:
+def _off_the_medial_axis(y: FloatArray, tiny: float, side: Side | None) -> FloatArray:
     """Replace vanishing coordinates by tiny ones with the sign of `side`."""
-    hint = np.ones_like(y) if side is None else side
-    return np.where(np.abs(y) < tiny, np.where(hint < 0, -tiny, tiny), y)
+    vanishing = np.abs(y) < tiny
+    if not vanishing.any():
+        return y
+    hint = np.ones_like(y) if side is None else side()
+    return np.where(vanishing, np.where(hint < 0, -tiny, tiny), y)

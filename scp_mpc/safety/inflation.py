@@ -17,6 +17,7 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.tangents import inverse_root, tangents
 
 _POINT = 1e-9  # [m] a semi-axis below this is that of a point
 
@@ -44,6 +45,19 @@ class Inflation(ABC):
         """
 
     @abstractmethod
+    def bend(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
+    ) -> FloatArray:
+        """Factor L (M, N, d+1, d-1) of g's second derivative in (p, s): Hessian = L L'.
+
+        Args:
+            sets: The obstacles' ellipsoids.
+            positions: Where g was linearised; as for `linearise`.
+            s: (M,) sizes there.
+            spaces: What `linearise` made of it.
+        """
+
+    @abstractmethod
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """Signed distance (M, N) [m] to the no-go set at s = s_ref; plus infinity if inactive."""
 
@@ -66,13 +80,38 @@ class ExactInflation(Inflation):
         """See the base class; normals are unit vectors."""
         offsets = positions - sets.means
         y = sets.to_eigenframe(offsets)
-        side = sets.to_eigenframe(_one_stage_earlier(offsets, start))
+
+        def side() -> FloatArray:
+            return sets.to_eigenframe(_one_stage_earlier(offsets, start))
+
         sd, n = signed_distance(y, s[:, None, None] * sets.deviations, side)
-        slope = -np.sqrt(np.square(sets.deviations * n).sum(axis=-1))
+        across = sets.deviations * n
+        slope = -np.sqrt(np.add.reduce(across * across, axis=-1))
         normal = sets.to_world(n)
         radii = sets.radii[:, None]
-        offset = np.einsum("mnd,mnd->mn", normal, sets.means) + radii
+        offset = np.add.reduce(normal * sets.means, axis=-1) + radii
         return _masked(sets, normal, slope, offset, sd - radii)
+
+    def bend(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
+    ) -> FloatArray:
+        """See the base class.
+
+        From y = grad h(n) + sd n with the support function h(n) = s |diag(sigma) n|: on the tangent
+        space T of n, dn = M^-1 (T'dy - T'(dh_n/ds) ds) with M = T' h_nn T + sd.
+        """
+        n = sets.to_eigenframe(spaces.normal)
+        half_width = np.maximum(-spaces.slope, _POINT)[..., None]  # sqrt(n' Sigma n)
+        pull = sets.deviations**2 * n / half_width  # dh_n/ds
+        T = tangents(n)
+        sd = spaces.value + sets.radii[:, None]
+        pulled = (pull[..., None, :] @ T)[..., 0, :]
+        wide = sets.deviations[..., None] * T
+        stiffness = np.swapaxes(wide, -2, -1) @ wide - pulled[..., :, None] * pulled[..., None, :]
+        stiffness *= (s[:, None, None] / half_width)[..., None]
+        stiffness += np.maximum(sd, _POINT)[..., None, None] * np.eye(T.shape[-1])
+        L = T @ inverse_root(stiffness)
+        return np.concatenate([sets.rotations @ L, -pull[..., None, :] @ L], axis=-2)
 
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """See the base class."""
@@ -101,17 +140,30 @@ class AxesInflation(Inflation):
         e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
         scale = self._scale(sets)
         w = y / e
-        at_centre = np.abs(w).max(axis=-1, keepdims=True) < 1e-12
+        at_centre = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True) < 1e-12
         if at_centre.any():
             side = sets.to_eigenframe(_one_stage_earlier(offsets, start))
             w = np.where(at_centre, _nudged(side / e), w)
-        norm = np.sqrt(np.square(w).sum(axis=-1))
+        norm = np.sqrt(np.add.reduce(w * w, axis=-1))
         gradient = scale[..., None] * w / (norm[..., None] * e)
-        slope = -(gradient * w * sets.deviations).sum(axis=-1)
+        slope = -np.add.reduce(gradient * w * sets.deviations, axis=-1)
         value = scale * (norm - 1)
         normal = sets.to_world(gradient)
-        offset = np.einsum("mnd,nd->mn", normal, positions) + slope * s[:, None] - value
+        offset = np.add.reduce(normal * positions, axis=-1) + slope * s[:, None] - value
         return _masked(sets, normal, slope, offset, value)
+
+    def bend(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
+    ) -> FloatArray:
+        """See the base class; the change of w with s alone is left out: g is not convex in it."""
+        y = sets.to_eigenframe(positions - sets.means)
+        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
+        w = y / e
+        norm = np.maximum(np.sqrt(np.square(w).sum(axis=-1, keepdims=True)), 1e-12)
+        T = tangents(w / norm) * np.sqrt(self._scale(sets)[..., None] / norm)[..., None]
+        L = T / e[..., None]
+        across = -(w * sets.deviations)[..., None, :] @ L
+        return np.concatenate([sets.rotations @ L, across], axis=-2)
 
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """See the base class."""

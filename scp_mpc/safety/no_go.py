@@ -50,6 +50,22 @@ class NoGoSets:
         return cls._stacked(predictions, slice(0, 1), robot_radius, len(predictions), 1, dim)
 
     @classmethod
+    def pairs(
+        cls, means: FloatArray, covariances: FloatArray, radii: FloatArray
+    ) -> "NoGoSets":
+        """Single stages, each in a slot of its own: means (K, d), covariances (K, d, d).
+
+        Args:
+            means: Expected positions [m].
+            covariances: Position covariances [m^2].
+            radii: (K,) robot radius + obstacle radius [m].
+        """
+        variances, rotations = np.linalg.eigh(covariances)
+        deviations = np.sqrt(np.maximum(variances, 0.0))
+        on = np.ones(len(means), dtype=np.bool_)
+        return cls(means[:, None], rotations[:, None], deviations[:, None], radii, on)
+
+    @classmethod
     def _stacked(
         cls,
         predictions: Sequence[ObstaclePrediction],

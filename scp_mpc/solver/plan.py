@@ -39,6 +39,23 @@ class Timing:
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """A rival plan that was tried beside the one from the nominal plan.
+
+    Attributes:
+        obstacle: Index of the obstacle that it was to pass on another side.
+        side: (d,) direction from the obstacle to where it passes.
+        cost: Of the plan that came of it, slack not included.
+        status: How that ended.
+    """
+
+    obstacle: int
+    side: FloatArray
+    cost: float
+    status: Status
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """The plan of one control step. M counts the obstacles that were passed.
 
@@ -51,7 +68,9 @@ class Plan:
         status: How it ended.
         kkt: Residuals of the original problem's KKT conditions at this plan.
         iterations: Steps of the descent that led to this plan.
-        qps: Quadratic programs in this control step by the solver that finished them.
+        qps: Quadratic programs in this control step by the solver that finished them: "kkt" (a
+            linear system, where nothing but the dynamics constrains the plan), "daqp", "osqp" or
+            "piqp".
         candidates: Rival plans on other sides that were tried; `switched` if one of them won.
         timing: Seconds spent.
         iterate: The point with its multipliers, padded to all obstacle slots.
@@ -66,7 +85,7 @@ class Plan:
     kkt: KKTResiduals
     iterations: int
     qps: dict[str, int]
-    candidates: int
+    candidates: tuple[Candidate, ...]
     switched: bool
     timing: Timing
     iterate: Iterate

@@ -1,62 +1,41 @@
 """Sequential convex programming for the problem of `scp_mpc.problem`.
 
-    nominal = previous plan, shifted (or the plan that ignores the obstacles)
-    repeat:  half-spaces about the nominal -> values of the QP -> solve, warm-started in x and y
-             -> new nominal -> half-spaces about it -> KKT residual of the original problem
-    until    that residual is below the tolerance, or the iterations run out
-             (from the third time on, about a point extrapolated from the last two nominals)
+    free plan, which ignores the obstacles: if it is clear of them, nothing can be better
+    nominal = previous plan, shifted (or the free plan)
+    descend:  half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
+              residual of the original problem is below the tolerance
+    sides:    where an obstacle shapes the plan, the same from paths on its other sides;
+              the best plan wins, if by enough
 
-A half-space about a point is exact there. So the KKT residual of the *next* QP at the present
-point and multipliers is the KKT residual of the original problem: the certificate costs one
-residual, and a step without an active obstacle takes one QP.
+Descents run on the condensed problem (`condensed_scp.py`). Where that has no answer, or the
+settings say so, they run on the sparse one (`sparse_scp.py`).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from threading import Lock
-from time import perf_counter
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.settings import Settings
-from scp_mpc.solver.acceleration import Anderson
+from scp_mpc.solver.condensed_scp import CondensedSCP
+from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.plan import Plan, Status, Timing
-from scp_mpc.solver.program import KKTResiduals
-from scp_mpc.solver.sides import candidates
+from scp_mpc.solver.plan import Candidate, Plan, Timing
+from scp_mpc.solver.sides import along, candidates
+from scp_mpc.solver.sparse_scp import SparseSCP
 from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.subproblem import Subproblem
-from scp_mpc.solver.trusted import TrustedSolver
-from scp_mpc.trajectory import Trajectory, rollout
+from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.trajectory import Trajectory
 
 # A rival must win this share of what it could win at most, or the plan flickers between sides.
 _HYSTERESIS = 0.05
 # Subproblems after which a rival must be ahead; costs fall from one to the next, so it is fair.
 _EXPLORATION = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """Where one run of the loop ended; `merit` is its cost and the penalty on its slack."""
-
-    iterate: Iterate
-    cost: float
-    merit: float
-    residuals: KKTResiduals
-    status: Status
-    iterations: int
-
-    def beats(self, other: "Descent", lead: float) -> bool:
-        """Whether this end is safe and the other is not, or its merit is better by `lead`."""
-        if self.status.ok != other.status.ok:
-            return self.status.ok
-        return self.merit < other.merit - lead
 
 
 class SCP:
@@ -68,15 +47,15 @@ class SCP:
     """
 
     def __init__(self, problem: Problem, settings: Settings | None = None) -> None:
-        """Lay out the subproblem and set up its solver."""
+        """Condense the problem, lay out the sparse one and set up the solvers."""
         self.problem = problem
         self.settings = Settings() if settings is None else settings
         if not isinstance(self.settings, Settings):
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
         self._busy = Lock()
-        self._subproblem = Subproblem(problem)
-        self._qp = TrustedSolver(self._subproblem.program, self.settings.qp)
-        self._linearising = self._solving = 0.0
+        self._sparse = SparseSCP(problem, self.settings)
+        condensed = CondensedSCP.of(problem, self.settings) if self.settings.condense else None
+        self._engine: CondensedSCP | SparseSCP = condensed or self._sparse
 
     def solve(
         self,
@@ -99,173 +78,106 @@ class SCP:
             InvalidArgumentError: Or one of its subclasses, before anything is changed.
             ConcurrentUseError: Another thread is using this solver.
         """
+        nominal = None if guess is None else as_iterate(guess, self.problem)
+        return self.solve_from(
+            x0, x_ref, obstacles, None if nominal is None else lambda: nominal, challenge
+        )
+
+    def solve_from(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        nominal: Callable[[], Iterate] | None,
+        challenge: bool,
+    ) -> Plan:
+        """`solve`, with a nominal plan that is made only where it is needed."""
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
-            return self._solve(x0, x_ref, obstacles, guess, challenge)
+            return self._solve(x0, x_ref, obstacles, nominal, challenge)
         finally:
             self._busy.release()
+
+    def forget(self) -> None:
+        """Forget what earlier programs left behind: the next step is that of a new solver."""
+        self._sparse.forget()
 
     def _solve(
         self,
         x0: ArrayLike,
         x_ref: ArrayLike,
         obstacles: Sequence[ObstaclePrediction],
-        guess: Trajectory | Iterate | None,
+        nominal: Callable[[], Iterate] | None,
         challenge: bool,
     ) -> Plan:
-        began = perf_counter()
+        watch = Stopwatch()
         step = StepData.read(self.problem, x0, x_ref, obstacles)
-        nominal = None if guess is None else as_iterate(guess, self.problem)
-        self._linearising = self._solving = 0.0
-        self._qp.reset_counts()
         if nominal is None:
-            self._qp.reset()
-        self._subproblem.write_step(step.x0, step.x_ref)
-        nominal = nominal or self._free_plan(step)
-        best = self._descend(step, nominal, self.settings.max_iterations)
-        tried, switched = 0, False
-        wanted = not best.status.ok or (challenge and best.iterate.touches)
-        if self.settings.sides and wanted:
-            best, tried, switched = self._challenge(step, best)
-        return self._plan(step, best, tried, switched, began)
+            self.forget()
+        self._engine.begin(step, watch)
+        tried: tuple[Candidate, ...] = ()
+        switched = False
+        best = self._engine.unhindered()
+        if best is None:
+            start = self._engine.free() if nominal is None else nominal()
+            best = self._descend(start, self.settings.max_iterations)
+            wanted = not best.status.ok or (challenge and best.iterate.touches)
+            if self.settings.sides and wanted:
+                best, tried, switched = self._challenge(step, best)
+        return self._plan(step, best, tried, switched, watch)
 
-    def _descend(self, step: StepData, nominal: Iterate, limit: int) -> Descent:
-        """Run the loop from one nominal plan, for at most `limit` subproblems."""
-        tolerance = self.settings.tolerance
-        self._subproblem.soft = False
-        iterate, iterations = self._subproblem.started(nominal), 0
-        residuals = self._linearise_about(step, iterate)
-        acceleration = Anderson(iterate, self.problem.model.position)
-        while residuals.worst > tolerance and iterations < limit:
-            convex = self._improve(step, iterate, residuals, acceleration)
-            if convex is None:
-                break
-            iterate, iterations = convex, iterations + 1
-            if self.settings.acceleration:
-                acceleration.learn(iterate)
-            residuals = self._linearise_about(step, iterate)
-        if iterations == 0 and residuals.worst > tolerance:
-            return self._given_up(step, nominal)
-        return self._ended(step, iterate, residuals, self._judge(residuals, iterate), iterations)
+    def _descend(self, nominal: Iterate, limit: int) -> Descent:
+        """Descend on the condensed problem; on the sparse one where that has no answer."""
+        best = self._engine.descend(nominal, limit)
+        explored = limit < self.settings.max_iterations
+        if best is not None and (explored or best.status.certified or self._engine is self._sparse):
+            return best
+        self._sparse.begin(self._engine.step, self._engine.watch)
+        other = self._sparse.descend(nominal, limit)
+        return other if best is None or other.beats(best, lead=0.0) else best
 
-    def _challenge(self, step: StepData, best: Descent) -> tuple[Descent, int, bool]:
+    def _challenge(
+        self, step: StepData, best: Descent
+    ) -> tuple[Descent, tuple[Candidate, ...], bool]:
         """Try the other sides, if there is something to win."""
-        free = self._free_plan(step)
-        most = best.merit - self._cost(step, free)  # no plan costs less than the free one
+        free = self._engine.free()
+        cost = self.problem.cost(free.states, free.inputs, free.s, step.x_ref)
+        most = best.merit - cost  # no plan costs less than the free one
         if most <= _HYSTERESIS * best.merit:
-            return best, 0, False
-        position = self.problem.model.position
-        value = step.half_spaces(self.problem, free.states, free.s).value
-        starts = candidates(free, position, step.sets, value)
-        rival: Descent | None = None
-        for start in starts:
-            other = self._descend(step, start, _EXPLORATION)
+            return best, (), False
+        tried, rival = [], None
+        for side in candidates(step, free.states[1:, self.problem.model.position], free.s):
+            other = self._descend(along(free, self.problem, side.path), _EXPLORATION)
+            tried.append(Candidate(side.obstacle, side.normal, other.cost, other.status))
             if rival is None or other.beats(rival, lead=0.0):
                 rival = other
         if rival is None or not rival.beats(best, _HYSTERESIS * most):
-            return best, len(starts), False
+            return best, tuple(tried), False
         if not rival.status.certified:
-            refined = self._descend(step, rival.iterate, self.settings.max_iterations)
+            refined = self._descend(rival.iterate, self.settings.max_iterations)
             refined = replace(refined, iterations=rival.iterations + refined.iterations)
             rival = rival if rival.beats(refined, lead=0.0) else refined
-        return rival, len(starts), True
-
-    def _improve(
-        self, step: StepData, iterate: Iterate, residuals: KKTResiduals, acceleration: Anderson
-    ) -> Iterate | None:
-        """Solve one subproblem: about the extrapolated point if that helps, else the iterate."""
-        bold = acceleration.propose(iterate)
-        if bold is not None:
-            self._write_half_spaces(step, bold)
-            convex = self._solve_convex(iterate, residuals)
-            if convex is not None and self._merit(step, convex) <= self._merit(step, iterate):
-                return convex
-            acceleration.reject()
-            self._write_half_spaces(step, iterate)
-        convex = self._solve_convex(iterate, residuals)
-        if convex is None and not self._subproblem.soft:
-            self._subproblem.soft = True  # nobody found a plan within all half-spaces
-            convex = self._solve_convex(iterate, residuals)
-        return convex
-
-    def _solve_convex(self, iterate: Iterate, residuals: KKTResiduals) -> Iterate | None:
-        """Solve the subproblem as it stands, warm-started at an iterate."""
-        began = perf_counter()
-        solution = self._qp.solve(*self._subproblem.pack(iterate), residuals.worst)
-        self._solving += perf_counter() - began
-        return None if solution is None else self._subproblem.unpack(solution.x, solution.y)
-
-    def _linearise_about(self, step: StepData, iterate: Iterate) -> KKTResiduals:
-        """Write the half-spaces about an iterate; return its residuals in the original problem."""
-        self._write_half_spaces(step, iterate)
-        return self._subproblem.residuals(iterate)
-
-    def _write_half_spaces(self, step: StepData, iterate: Iterate) -> None:
-        began = perf_counter()
-        spaces = step.half_spaces(self.problem, iterate.states, iterate.s)
-        self._subproblem.write_half_spaces(spaces)
-        self._linearising += perf_counter() - began
-
-    def _free_plan(self, step: StepData) -> Iterate:
-        """The plan that ignores the obstacles; its cost bounds every other from below."""
-        self._subproblem.soft = False
-        problem = self.problem
-        self._subproblem.write_half_spaces(
-            HalfSpaces.none(problem.max_obstacles, problem.horizon, problem.model.dim)
-        )
-        nominal = self._subproblem.resting(step.x_ref)
-        return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
-
-    def _judge(self, residuals: KKTResiduals, iterate: Iterate) -> Status:
-        tolerance = self.settings.tolerance
-        inside = max(residuals.feasibility, iterate.slack.max(initial=0.0)) > tolerance
-        if residuals.worst <= tolerance:
-            return Status.SOFTENED if inside else Status.CONVERGED
-        return Status.VIOLATING if inside else Status.FEASIBLE
-
-    def _given_up(self, step: StepData, nominal: Iterate) -> Descent:
-        """Keep the nominal inputs, roll them out from x0, and own up to what they violate."""
-        problem = self.problem
-        inputs = np.clip(nominal.inputs, problem.u_min, problem.u_max)
-        path = rollout(problem.model.step, step.x0, inputs)
-        s = np.full(problem.max_obstacles, problem.margin.reference)
-        value = step.half_spaces(problem, path.states, s).value
-        iterate = Iterate(path.states, inputs, s, np.maximum(0.0, -value))
-        unknown = KKTResiduals(np.inf, np.inf, np.inf)
-        return self._ended(step, iterate, unknown, Status.FALLBACK, 0)
-
-    def _ended(
-        self,
-        step: StepData,
-        iterate: Iterate,
-        residuals: KKTResiduals,
-        status: Status,
-        iterations: int,
-    ) -> Descent:
-        cost = self._cost(step, iterate)
-        merit = cost + self._penalty(iterate)
-        return Descent(iterate.frozen(), cost, merit, residuals, status, iterations)
-
-    def _merit(self, step: StepData, iterate: Iterate) -> float:
-        return self._cost(step, iterate) + self._penalty(iterate)
-
-    def _penalty(self, iterate: Iterate) -> float:
-        return self.problem.slack_weight * float(iterate.slack.sum())
-
-    def _cost(self, step: StepData, iterate: Iterate) -> float:
-        return self.problem.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)
+        return rival, tuple(tried), True
 
     def _plan(
-        self, step: StepData, best: Descent, tried: int, switched: bool, began: float
+        self,
+        step: StepData,
+        best: Descent,
+        tried: tuple[Candidate, ...],
+        switched: bool,
+        watch: Stopwatch,
     ) -> Plan:
-        iterate = best.iterate
+        iterate, inside = best.iterate, watch.inside.seconds
         timing = Timing(
-            linearise=self._linearising,
-            update=self._solving - self._qp.seconds,
-            solve=self._qp.seconds,
-            total=perf_counter() - began,
+            linearise=watch.linearising.seconds,
+            update=watch.solving.seconds - inside,
+            solve=inside,
+            total=watch.elapsed,
         )
+        qps = self._engine.finished
+        if self._engine is not self._sparse and self._sparse.finished:
+            qps = qps + self._sparse.finished
         return Plan(
             X=iterate.states,
             U=iterate.inputs,
@@ -275,7 +187,7 @@ class SCP:
             status=best.status,
             kkt=best.residuals,
             iterations=best.iterations,
-            qps=dict(self._qp.finished),
+            qps=dict(qps),
             candidates=tried,
             switched=switched,
             timing=timing,

@@ -3,7 +3,8 @@
 One linearisation keeps to one side; a plan that trails behind an obstacle is a local optimum. A
 candidate is a path that need not obey the dynamics: where the plan that ignores the obstacles
 would enter a no-go set, it is moved to the point of the exact inflation's boundary whose normal is
-square to the relative motion. Linearising about it gives half-spaces on that side, sound as any.
+square to the relative motion. For an obstacle that crosses, these are before it and behind it.
+Linearising about the path gives half-spaces on that side, sound as any.
 
 Notation:
     p       (N, d)      positions of the plan that ignores the obstacles
@@ -11,41 +12,68 @@ Notation:
     n       (d,)        side: a unit vector square to v
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.problem import Problem
 from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.step_data import StepData
+
+
+MAX_CANDIDATES = 4  # in one control step, whatever the number of obstacles
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Where to pass which obstacle.
+
+    Attributes:
+        obstacle: Its index.
+        normal: (d,) from the obstacle to where the path passes.
+        path: (N, d) positions to linearise about.
+    """
+
+    obstacle: int
+    normal: FloatArray
+    path: FloatArray
 
 
 def candidates(
-    free: Iterate, position: IntArray, sets: NoGoSets, value: FloatArray
-) -> list[Iterate]:
-    """Return starts that pass the first conflicting obstacle on its sides; none if none conflicts.
+    step: StepData, path: FloatArray, s: FloatArray, limit: int = MAX_CANDIDATES
+) -> list[Side]:
+    """Return the sides of the obstacles in conflict, the first conflict first; none without any.
 
     Args:
-        free: The plan that ignores the obstacles.
-        position: (d,) indices of the position within the state.
-        sets: The obstacles' ellipsoids.
-        value: (M, N) constraint function along `free`; negative means conflict.
+        step: The control step.
+        path: (N, d) positions of the plan that ignores the obstacles.
+        s: (M,) sizes of the ellipsoids.
+        limit: How many at most.
     """
-    conflict = value < 0
-    if not conflict.any():
-        return []
+    conflict = step.conflicts(path, s)
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
-    j = int(first.argmin())
-    stages = np.flatnonzero(conflict[j])
-    return [
-        _moved(free, position, stages, _boundary_points(sets, free.s, j, stages, n))
-        for n in _sides(free.states[1:, position], sets.means[j], stages)
-    ]
+    found: list[Side] = []
+    for j in np.argsort(first, kind="stable")[: np.count_nonzero(first < conflict.shape[1])]:
+        stages = np.flatnonzero(conflict[j])
+        for n in _normals(path - step.means[j, 1:], stages):
+            moved = path.copy()
+            moved[stages] = _boundary_points(step, float(s[j]), int(j), stages, n)
+            found.append(Side(int(j), n, moved))
+        if len(found) >= limit:
+            break
+    return found[:limit]
 
 
-def _sides(positions: FloatArray, means: FloatArray, stages: IntArray) -> list[FloatArray]:
-    relative = positions - means
-    begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(means) - 1)
+def along(free: Iterate, problem: Problem, path: FloatArray) -> Iterate:
+    """The free plan, moved to a path (N, d)."""
+    states = free.states.copy()
+    states[1:, problem.model.position] = path
+    return replace(free, states=states)
+
+
+def _normals(relative: FloatArray, stages: IntArray) -> list[FloatArray]:
+    begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(relative) - 1)
     v = relative[end] - relative[begin]
     if not v.any():
         v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
@@ -55,18 +83,9 @@ def _sides(positions: FloatArray, means: FloatArray, stages: IntArray) -> list[F
 
 
 def _boundary_points(
-    sets: NoGoSets, s: FloatArray, j: int, stages: IntArray, n: FloatArray
+    step: StepData, s: float, j: int, stages: IntArray, n: FloatArray
 ) -> FloatArray:
     """Boundary points of ellipsoid (+) ball with outward normal n: mu + s Sigma n / |.| + r n."""
-    rotation, deviation = sets.rotations[j, stages], sets.deviations[j, stages]
-    local = np.einsum("kji,j->ki", rotation, n)
-    half_width = np.sqrt(np.square(deviation * local).sum(axis=-1, keepdims=True))
-    reach = deviation**2 * local / np.maximum(half_width, 1e-12)
-    ellipsoid = np.einsum("kij,kj->ki", rotation, s[j] * reach)
-    return sets.means[j, stages] + ellipsoid + sets.radii[j] * n
-
-
-def _moved(free: Iterate, position: IntArray, stages: IntArray, points: FloatArray) -> Iterate:
-    states = free.states.copy()
-    states[np.ix_(stages + 1, position)] = points
-    return replace(free, states=states)
+    pull = step.covariances[j, stages + 1] @ n
+    half_width = np.sqrt(np.maximum(pull @ n, 0.0))[:, None]
+    return step.means[j, stages + 1] + s * pull / np.maximum(half_width, 1e-12) + step.radii[j] * n

@@ -9,6 +9,7 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.settings import QPSettings
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
 from scp_mpc.solver.qp import OSQPSolver, QPSolution
+from scp_mpc.solver.stopwatch import Lap
 from scp_mpc.solver.rescue import RescueSolver
 
 _USABLE = 1e-3  # KKT residual beyond which a point is no solution
@@ -22,7 +23,6 @@ class TrustedSolver:
 
     Attributes:
         finished: How many programs each solver finished since `reset_counts`.
-        seconds: Time spent in the solvers since `reset_counts`.
     """
 
     def __init__(self, program: QuadraticProgram, settings: QPSettings) -> None:
@@ -32,19 +32,20 @@ class TrustedSolver:
         self._osqp = OSQPSolver(program, settings)
         self._rescue = None if not settings.rescue else RescueSolver(program)
         self.finished: Counter[str] = Counter()
-        self.seconds = 0.0
 
-    def solve(self, x: FloatArray, y: FloatArray, residual: float = 0.0) -> QPSolution | None:
+    def solve(self, x: FloatArray, y: FloatArray, residual: float = 0.0, lap: Lap | None = None) -> QPSolution | None:
         """Solve the program as it stands, warm-started at x and y; None if nobody could.
 
         Args:
             x: (n,) start.
             y: (m,) its multipliers.
             residual: KKT residual of the start; a bad one is left to the rescue at once.
+            lap: Adds up the seconds spent in the solvers.
         """
         best, best_residual = None, _USABLE
         for solution in self._attempts(x, y, residual > self._cold):
-            self.seconds += solution.seconds
+            if lap is not None:
+                lap.seconds += solution.seconds
             residuals = self._residuals(solution)
             if residuals.feasibility <= self._accuracy and residuals.worst < best_residual:
                 best, best_residual = solution, residuals.worst
@@ -59,9 +60,8 @@ class TrustedSolver:
         self._osqp.reset()
 
     def reset_counts(self) -> None:
-        """Start counting programs and seconds anew."""
+        """Start counting programs anew."""
         self.finished = Counter()
-        self.seconds = 0.0
 
     def _attempts(self, x: FloatArray, y: FloatArray, cold: bool) -> Iterator[QPSolution]:
         if cold and self._rescue is not None:

@@ -1,0 +1,124 @@
+"""The condensed problem: dynamics and cost eliminated, once and for all.
+
+Constraints act on positions, inputs and sizes only. Collect those in y. Every plan that obeys the
+dynamics is
+
+    y = y_free + S v,        cost = cost_free + |v|^2 / 2 * 1        (in the program's units)
+
+where y_free is the plan that nothing constrains and v are its inputs (and sizes) in coordinates
+that make the Hessian the identity. S depends on model, weights and horizon alone.
+
+Notation:
+    y       [p_1 .. p_N | u_0 .. u_{N-1} | s_1 .. s_M], p as deviation from the reference
+    e       (N, nx)     deviations x_i - xref_i, i = 1 .. N
+    nu      (N, nx)     multipliers of the dynamics
+    H       2 (R + G'QG), Hessian in the inputs, G the map from inputs to e;  H^-1 = L L',  u = L v
+    D e = B u + drift   all stages' dynamics, D block bidiagonal with unit diagonal
+
+    2 Q e + D' nu = phi_e,   2 R u - B' nu = phi_u      (forces phi of the constraints on e and u)
+"""
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import solve_triangular
+from scipy.sparse.linalg import splu
+
+from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.problem import Problem
+
+
+class Condensed:
+    """Free plan and response of a problem with linear, time-invariant dynamics.
+
+    Initialisation: factorises the unconstrained problem's KKT matrix.
+
+    Usage: `start` once per control step; `free` and `deviations` then belong to it.
+
+    Attributes:
+        response: (ny, nv) S.
+        lower: (ny,) bounds of y; infinite for positions.
+        upper: (ny,) likewise.
+        p: Slice of the positions in y; likewise `u` and `s`.
+        boxed: Slice of the entries of y that are bounded and can move.
+
+    Raises:
+        numpy.linalg.LinAlgError: The Hessian in the inputs is singular: R = 0, say.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        """Factorise the KKT matrix of the unconstrained problem and build S."""
+        self._problem = problem
+        model, N, M = problem.model, problem.horizon, problem.max_obstacles
+        margin = problem.margin
+        self._states = N * model.nx
+        self.p = slice(0, N * model.dim)
+        self.u = slice(self.p.stop, self.p.stop + N * model.nu)
+        self.s = slice(self.u.stop, self.u.stop + M)
+        # A size that cannot shrink never moves: larger ones only cost more and leave less room.
+        self.moving_sizes = M if margin.lower < margin.reference else 0
+        self.boxed = slice(self.u.start, self.u.stop + self.moving_sizes)
+        D = sparse.eye(N * model.nx) - sparse.kron(sparse.eye(N, k=-1), model.A)
+        self._dynamics = splu(  # its own factor: no fill, no pivoting
+            sparse.csc_matrix(D), permc_spec="NATURAL", diag_pivot_thresh=0.0
+        )
+        self._kkt = splu(self._kkt_matrix(D))
+        self._right = np.zeros(self._kkt.shape[0])
+        self._drift = np.zeros((N, model.nx))
+        self._from = self._outputs()
+        self._sizes = np.full(M, margin.reference)
+        self.response = self._respond()
+        unbounded = np.full(N * model.dim, np.inf)
+        self.lower = np.concatenate(
+            [-unbounded, np.tile(problem.u_min, N), np.full(M, margin.lower)]
+        )
+        self.upper = np.concatenate(
+            [unbounded, np.tile(problem.u_max, N), np.full(M, margin.upper)]
+        )
+
+    def start(self, x0: FloatArray, x_ref: FloatArray) -> FloatArray:
+        """Return y of the plan that nothing constrains, from x0 (nx,) along x_ref (N+1, nx)."""
+        A = self._problem.model.A
+        self._drift = x_ref[:-1] @ A.T - x_ref[1:]
+        self._drift[0] = A @ x0 - x_ref[1]
+        self._right[-self._states :] = self._drift.ravel()
+        return np.concatenate([self._kkt.solve(self._right)[self._from], self._sizes])
+
+    def deviations(self, inputs: FloatArray) -> FloatArray:
+        """Roll inputs (N, nu) out from this step's x0: e (N, nx)."""
+        pushed = inputs @ self._problem.model.B.T + self._drift
+        e: FloatArray = self._dynamics.solve(pushed.ravel())
+        return e.reshape(pushed.shape)
+
+    def costates(self, forces: FloatArray) -> FloatArray:
+        """Solve D' nu = forces (N, nx) for nu (N, nx): backwards in time."""
+        nu: FloatArray = self._dynamics.solve(forces.ravel(), trans="T")
+        return nu.reshape(forces.shape)
+
+    def _kkt_matrix(self, D: sparse.spmatrix) -> sparse.csc_matrix:
+        problem, N = self._problem, self._problem.horizon
+        Q = sparse.block_diag([2 * problem.Q] * (N - 1) + [2 * problem.Qf])
+        R = sparse.kron(sparse.eye(N), 2 * problem.R)
+        B = sparse.kron(sparse.eye(N), problem.model.B)
+        return sparse.csc_matrix(sparse.bmat([[Q, None, D.T], [None, R, -B.T], [D, -B, None]]))
+
+    def _outputs(self) -> IntArray:
+        """Places of positions and inputs within the KKT system's unknowns."""
+        model, N = self._problem.model, self._problem.horizon
+        p = np.arange(N)[:, None] * model.nx + model.position
+        return np.concatenate([p.ravel(), self._states + np.arange(N * model.nu)])
+
+    def _respond(self) -> FloatArray:
+        """Push every input with a unit force: inputs answer with H^-1, positions with G H^-1."""
+        margin, M = self._problem.margin, self._problem.max_obstacles
+        pushes = self.u.stop - self.u.start
+        push = np.zeros((len(self._right), pushes))
+        push[self._states + np.arange(pushes), np.arange(pushes)] = 1.0
+        moved = self._kkt.solve(push)[self._from]
+        inverse = (moved[self.u] + moved[self.u].T) / 2
+        L = np.linalg.cholesky(inverse)
+        S = np.zeros((self.s.stop, pushes + self.moving_sizes))
+        S[self.p, :pushes] = solve_triangular(L, moved[self.p].T, lower=True).T
+        S[self.u, :pushes] = L
+        if self.moving_sizes:
+            S[self.s, pushes:] = np.eye(M) / np.sqrt(2 * margin.weight)
+        return S

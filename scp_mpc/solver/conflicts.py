@@ -1,0 +1,98 @@
+"""The pairs of obstacle and stage that can matter in one control step; all others stay out.
+
+Notation:
+    K           number of pairs (j, i)
+    y           outputs of the condensed problem, see `condensed.py`
+    g   (K,)    constraint function, to be non-negative [m]
+    a   (K, w)  its gradient with respect to y[at]: position and size, w = d + 1
+    L   (K, w, d-1)     factor of its second derivative, L L'
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.safety.halfspaces import HalfSpaces
+from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.step_data import StepData
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """The constraints of all pairs, linearised about one point.
+
+    Attributes:
+        y: (ny,) the point.
+        g: (K,) values there.
+        a: (K, w) gradients.
+        positions: (K, 1, d) of the robot, sizes (K,) of the ellipsoids, and the half-spaces.
+    """
+
+    y: FloatArray
+    g: FloatArray
+    a: FloatArray
+    positions: FloatArray
+    spaces: HalfSpaces
+
+
+class Conflicts:
+    """Geometry of some pairs of obstacle and stage in one control step.
+
+    Attributes:
+        obstacle: (K,) j; likewise `stage`, counted from 0.
+        at: (K, w) where position and size stand in y.
+        response: (K, w, nv) rows of S there.
+
+    Args:
+        step: The control step.
+        condensed: Where positions and sizes stand in y.
+        near: (J, N) the pairs.
+    """
+
+    def __init__(self, step: StepData, condensed: Condensed, near: BoolArray) -> None:
+        """Gather the pairs' predictions."""
+        self.obstacle, self.stage = j, i = np.nonzero(near)
+        d = step.problem.model.dim
+        self.at = np.empty((len(j), d + 1), dtype=np.intp)
+        self.at[:, :d] = i[:, None] * d + np.arange(d)
+        self.at[:, d] = condensed.s.start + j
+        self.response = condensed.response[self.at]
+        self._step, self._p = step, condensed.p
+        self._sets = NoGoSets.pairs(
+            step.means[j, i + 1], step.covariances[j, i + 1], step.radii[j]
+        )
+        self._means_before = step.means[j, i]
+        position = step.problem.model.position
+        self._reference = step.x_ref[1:, position]
+        self._now = step.x0[position]
+
+    def positions(self, y: FloatArray) -> FloatArray:
+        """(N+1, d) of the robot, from now on [m]."""
+        path = np.empty((len(self._reference) + 1, len(self._now)))
+        path[0] = self._now
+        np.add(self._reference, y[self._p].reshape(self._reference.shape), out=path[1:])
+        return path
+
+    def tangent(self, y: FloatArray) -> Tangent:
+        """Linearise about y."""
+        path = self.positions(y)
+        positions, s = path[self.stage + 1][:, None], y[self.at[:, -1]]
+        spaces = self._step.problem.no_go.linearise(
+            self._sets, positions, s, path[self.stage] - self._means_before
+        )
+        a = np.concatenate([spaces.normal[:, 0], spaces.slope], axis=1)
+        return Tangent(y, spaces.value[:, 0], a, positions, spaces)
+
+    def bend(self, tangent: Tangent) -> FloatArray:
+        """Factor L (K, w, d-1) of the second derivatives at the tangent's point."""
+        s = tangent.y[self.at[:, -1]]
+        no_go = self._step.problem.no_go
+        return no_go.bend(self._sets, tangent.positions, s, tangent.spaces)[:, 0]
+
+    def table(self, values: FloatArray, fill: float, slots: int, stages: int) -> FloatArray:
+        """Return one value per pair as (M, N), with `fill` elsewhere."""
+        table = np.full((slots, stages), fill)
+        table[self.obstacle, self.stage] = values
+        return table

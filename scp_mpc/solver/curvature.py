@@ -1,0 +1,52 @@
+"""From a convex step to Newton's: the geometric series that the convex steps would add up to.
+
+The convex subproblem leaves out that half-spaces turn as the plan moves along a curved obstacle. A
+step d of it, with forces lambda, is followed by T d, then T^2 d and so on, where
+
+    T = (I - A'(A A')^-1 A) K,    K = sum_k lambda_k L_k L_k'
+
+maps a displacement to the one that the turned half-spaces cause, within the active set A. So the
+convex steps converge if and only if T contracts; then their sum is Newton's step on the original
+problem's KKT conditions,
+
+    (I - T)^-1 d = d + P L (I - L' P L)^-1 L' d,    P = I - A'(A A')^-1 A
+
+and I - L' P L is positive definite: the second-order condition. Where it is not, the convex steps
+lead away from this point, and there is nothing to sum.
+
+Notation:
+    d   (nv,)       step of the condensed problem
+    A   (k, nv)     responses of the active constraints
+    L   (q, nv)     responses of the bends, each times the root of its force
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg.lapack import dposv, dpotrs
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.solver.active_set import Held
+
+
+def summed(held: Held, bends: FloatArray, step: FloatArray) -> Held | None:
+    """Return the solution that the convex steps from `held` on tend to; None if they do not.
+
+    Args:
+        held: Solution of the convex subproblem.
+        bends: (q, nv) L, as above.
+        step: (q,) L' d: the convex step as the bends see it.
+    """
+    bent = np.eye(len(bends)) - bends @ bends.T
+    within = np.zeros((0, len(bends)))
+    if len(held.indices):
+        across = held.rows @ bends.T
+        within, _ = dpotrs(held.factor, across)
+        bent += across.T @ within
+    _, turn, info = dposv(bent, step)
+    if info != 0:
+        return None
+    change = within @ turn
+    force = held.force.copy()
+    force[held.indices] -= change
+    return replace(held, v=held.v + turn @ bends - change @ held.rows, force=force)

@@ -1,0 +1,165 @@
+"""Sequential convex programming on the sparse program: for any problem, OSQP first.
+
+    repeat:  half-spaces about the nominal -> values of the QP -> solve, warm-started in x and y
+             -> new nominal -> half-spaces about it -> KKT residual of the original problem
+    until    that residual is below the tolerance, or the iterations run out
+             (from the third time on, about a point extrapolated from the last two nominals)
+
+A half-space about a point is exact there. So the KKT residual of the *next* QP at the present
+point and multipliers is the KKT residual of the original problem: the certificate costs one
+residual, and a step without an active obstacle takes one QP.
+"""
+
+from collections import Counter
+
+import numpy as np
+
+from scp_mpc.problem import Problem
+from scp_mpc.safety.halfspaces import HalfSpaces
+from scp_mpc.settings import Settings
+from scp_mpc.solver.acceleration import Anderson
+from scp_mpc.solver.descent import Descent, judge
+from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.plan import Status
+from scp_mpc.solver.program import KKTResiduals
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.solver.subproblem import Subproblem
+from scp_mpc.solver.trusted import TrustedSolver
+from scp_mpc.trajectory import rollout
+
+
+class SparseSCP:
+    """Descends from a nominal plan, one sparse quadratic program per iteration.
+
+    Usage: `begin` a step; then `free` and `descend` as often as wanted.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings) -> None:
+        """Lay out the subproblem and set up its solver."""
+        self._problem, self._settings = problem, settings
+        self._subproblem = Subproblem(problem)
+        self._qp = TrustedSolver(self._subproblem.program, settings.qp)
+        self._stale = False
+
+    @property
+    def finished(self) -> Counter[str]:
+        """Programs finished since `begin`, by solver."""
+        return self._qp.finished
+
+    def forget(self) -> None:
+        """Forget what earlier programs left behind, before the next one."""
+        self._stale = True
+
+    def begin(self, step: StepData, watch: Stopwatch) -> None:
+        """Read a control step."""
+        if self._stale:
+            self._qp.reset()
+            self._stale = False
+        self.step, self.watch = step, watch
+        self._qp.reset_counts()
+        self._subproblem.write_step(step.x0, step.x_ref)
+
+    def unhindered(self) -> None:
+        """No shortcut: see `CondensedSCP.unhindered`."""
+
+    def free(self) -> Iterate:
+        """The plan that ignores the obstacles; its cost bounds every other from below."""
+        self._subproblem.soft = False
+        problem = self._problem
+        self._subproblem.write_half_spaces(
+            HalfSpaces.none(problem.max_obstacles, problem.horizon, problem.model.dim)
+        )
+        nominal = self._subproblem.resting(self.step.x_ref)
+        return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
+
+    def descend(self, nominal: Iterate, limit: int) -> Descent:
+        """Run the loop from one nominal plan, for at most `limit` subproblems."""
+        tolerance = self._settings.tolerance
+        self._subproblem.soft = False
+        iterate, iterations = self._subproblem.started(nominal), 0
+        residuals = self._linearise_about(iterate)
+        acceleration = Anderson(iterate, self._problem.model.position)
+        while residuals.worst > tolerance and iterations < limit:
+            convex = self._improve(iterate, residuals, acceleration)
+            if convex is None:
+                break
+            iterate, iterations = convex, iterations + 1
+            if self._settings.acceleration:
+                acceleration.learn(iterate)
+            residuals = self._linearise_about(iterate)
+        if iterations == 0 and residuals.worst > tolerance:
+            return self._given_up(nominal)
+        status = judge(residuals, iterate.slack.max(initial=0.0), tolerance)
+        return self._ended(iterate, residuals, status, iterations)
+
+    def _improve(
+        self, iterate: Iterate, residuals: KKTResiduals, acceleration: Anderson
+    ) -> Iterate | None:
+        """Solve one subproblem: about the extrapolated point if that helps, else the iterate."""
+        bold = acceleration.propose(iterate)
+        if bold is not None:
+            self._write_half_spaces(bold)
+            convex = self._solve_convex(iterate, residuals)
+            if convex is not None and self._merit(convex) <= self._merit(iterate):
+                return convex
+            acceleration.reject()
+            self._write_half_spaces(iterate)
+        convex = self._solve_convex(iterate, residuals)
+        if convex is None and not self._subproblem.soft:
+            self._subproblem.soft = True  # nobody found a plan within all half-spaces
+            convex = self._solve_convex(iterate, residuals)
+        return convex
+
+    def _solve_convex(self, iterate: Iterate, residuals: KKTResiduals) -> Iterate | None:
+        """Solve the subproblem as it stands, warm-started at an iterate."""
+        with self.watch.solving:
+            x, y = self._subproblem.pack(iterate)
+            solution = self._qp.solve(x, y, residuals.worst, self.watch.inside)
+        return None if solution is None else self._subproblem.unpack(solution.x, solution.y)
+
+    def _linearise_about(self, iterate: Iterate) -> KKTResiduals:
+        """Write the half-spaces about an iterate; return its residuals in the original problem."""
+        self._write_half_spaces(iterate)
+        return self._subproblem.residuals(iterate)
+
+    def _write_half_spaces(self, iterate: Iterate) -> None:
+        with self.watch.linearising:
+            spaces = self.step.half_spaces(iterate.states, iterate.s)
+            self._subproblem.write_half_spaces(spaces)
+
+    def _given_up(self, nominal: Iterate) -> Descent:
+        """Keep the nominal inputs, roll them out from x0, and own up to what they violate."""
+        problem = self._problem
+        inputs = np.clip(nominal.inputs, problem.u_min, problem.u_max)
+        path = rollout(problem.model.step, self.step.x0, inputs)
+        s = np.full(problem.max_obstacles, problem.margin.reference)
+        value = self.step.half_spaces(path.states, s).value
+        iterate = Iterate(path.states, inputs, s, np.maximum(0.0, -value))
+        unknown = KKTResiduals(np.inf, np.inf, np.inf)
+        return self._ended(iterate, unknown, Status.FALLBACK, 0)
+
+    def _ended(
+        self,
+        iterate: Iterate,
+        residuals: KKTResiduals,
+        status: Status,
+        iterations: int,
+    ) -> Descent:
+        cost = self._cost(iterate)
+        merit = cost + self._penalty(iterate)
+        return Descent(iterate.frozen, cost, merit, residuals, status, iterations)
+
+    def _merit(self, iterate: Iterate) -> float:
+        return self._cost(iterate) + self._penalty(iterate)
+
+    def _penalty(self, iterate: Iterate) -> float:
+        return self._problem.slack_weight * float(iterate.slack.sum())
+
+    def _cost(self, iterate: Iterate) -> float:
+        return self._problem.cost(iterate.states, iterate.inputs, iterate.s, self.step.x_ref)
+
