@@ -52,6 +52,7 @@ class Settings:
         acceleration: On the sparse programs, extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
+        rivals: How many of the ways past it to follow to the end; all are ranked.
         qp: Settings of the quadratic program's solvers.
     """
 
@@ -60,7 +61,8 @@ class Settings:
     condense: bool = True
     acceleration: bool = True
     sides: bool = True
-    sides_interval: int = 2
+    sides_interval: int = 1
+    rivals: int = 1
     qp: QPSettings = field(default_factory=QPSettings)
 
     def __post_init__(self) -> None:
@@ -68,6 +70,7 @@ class Settings:
         require_positive("tolerance", self.tolerance)
         as_count("max_iterations", self.max_iterations)
         as_count("sides_interval", self.sides_interval)
+        as_count("rivals", self.rivals)
         require_flags(self, "condense", "acceleration", "sides")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")

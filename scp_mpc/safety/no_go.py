@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scp_mpc.arrays import BoolArray, FloatArray
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 
 
@@ -89,6 +89,16 @@ class NoGoSets:
             means[:count] = np.stack([o.means[rows] for o in predictions])
             radii[:count] = robot_radius + np.array([o.radius for o in predictions])
         return cls(means, rotations, deviations, radii, np.arange(slots) < count)
+
+    def taken(self, slots: IntArray) -> "NoGoSets":
+        """The given slots, in that order."""
+        return NoGoSets(
+            self.means[slots],
+            self.rotations[slots],
+            self.deviations[slots],
+            self.radii[slots],
+            self.active[slots],
+        )
 
     def to_eigenframe(self, offsets: FloatArray) -> FloatArray:
         """Rotate offsets (M, N, d) from the world into the ellipsoids' axes: R' v."""

@@ -127,6 +127,15 @@ class ActiveSetSolver:
         capped[self._bounds :] = force[self._bounds :] >= cap
         return settle(program, -np.sign(force).astype(np.intc), capped, cap)
 
+    def glimpse(
+        self, lower: FloatArray, upper: FloatArray, A: FloatArray, b: FloatArray
+    ) -> tuple[FloatArray, BoolArray] | None:
+        """Solve without a guess; return v (nv,) and which half-spaces (K,) push, or None."""
+        rows = np.concatenate([self._rows, A])
+        least, most = np.concatenate([lower, b]), np.concatenate([upper, np.full(len(b), _FAR)])
+        v, _, flag, info = daqp.solve(self._identity, self._zero, rows, most, least)
+        return (v, info["lam"][self._bounds :] != 0) if flag in _SOLVED else None
+
     def _yielding(
         self, program: CondensedProgram, sense: IntArray, cap: float
     ) -> tuple[int, FloatArray]:

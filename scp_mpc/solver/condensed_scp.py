@@ -11,6 +11,8 @@ Pairs of obstacle and stage that are far away stay out of the program and are re
 """
 
 from collections import Counter
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -22,13 +24,17 @@ from scp_mpc.solver.certificate import Certificate, Point, Pushed
 from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.conflicts import Conflicts, Tangent
 from scp_mpc.solver.curvature import summed
-from scp_mpc.solver.descent import Descent, judge
-from scp_mpc.solver.iterate import Iterate, Multipliers
+from scp_mpc.solver.descent import Descent, Glimpse, hopeless, judge
+from scp_mpc.solver.iterate import Iterate, Multipliers, moved
+from scp_mpc.solver.sides import Passing, same_way
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
 _NEAR = 0.5  # [m] beyond the no-go set; pairs farther off stay out of the program
+_WIDE = 1.0  # [m] likewise, for a first look at the ways past an obstacle
 _NEGLIGIBLE = 1e-6  # [cost / m or unit of input] forces of the guess that are not active
+_ALIKE = 0.01  # relative difference of cost of plans that may become the same
+_SURPLUS = 0.01  # of the tolerance: worth one more iteration, whose convergence is quadratic
 _ROUNDING = 1e-9  # violation of a linearised constraint that is none
 
 
@@ -84,12 +90,56 @@ class CondensedSCP:
         point = self._certificate.certify(*self._certificate.rolled_out(y), reaction, None)
         return self._iterate(point, np.inf)
 
-    def descend(self, nominal: Iterate, limit: int) -> Descent | None:
-        """Descend from a nominal plan; None if a program could not be solved."""
+    def glimpses(self, free: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
+        """Solve one program about each path (N, d), all linearised at once.
+
+        A plan's cost is that of the plan that nothing constrains and |v|^2 / 2 more.
+        """
+        if not paths:
+            return []
+        c, step, position = self._condensed, self.step, self._problem.model.position
+        whole = np.empty((len(paths), step.problem.horizon + 1, len(position)))
+        whole[:, 0], whole[:, 1:] = step.x0[position], paths
+        near = step.within(self._path(self._within_bounds()[0]), free.s, _WIDE)
+        conflicts = Conflicts(step, c, np.ones((step.count, len(paths[0])), bool) if near is None else near)
+        with self.watch.linearising:
+            a, b = conflicts.about(whole, free.s)
+        A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
+        b = b - (a * self._free[conflicts.at]).sum(axis=2)
+        box = self._free[c.boxed]
+        lower, upper = c.lower[c.boxed] - box, c.upper[c.boxed] - box
+        found, nobody = [], np.zeros((step.count, len(paths[0])), dtype=np.bool_)
+        for rows, least, path in zip(A, b, paths, strict=True):
+            with self.watch.inside:
+                end = self._qp.glimpse(lower, upper, rows, least)
+            if end is None:
+                found.append(Glimpse(np.inf, nobody, partial(moved, free, position, path)))
+            else:
+                self.finished["daqp"] += 1
+                v, pushing = end
+                touched = conflicts.table(pushing, 0.0, step.count, len(path)) > 0
+                found.append(Glimpse(float(v @ v) / 2, touched, partial(self._at, free, v)))
+        return found
+
+    def _at(self, free: Iterate, v: FloatArray) -> Iterate:
+        """An iterate at the outputs of v, without forces."""
+        path = self._path(self._free + self._condensed.response @ v)
+        return moved(free, self._problem.model.position, path[1:])
+
+    def descend(
+        self, nominal: Iterate, limit: int, goal: Descent | None = None
+    ) -> Descent | None:
+        """Descend from a nominal plan; None if a program could not be solved.
+
+        Args:
+            nominal: Where to begin.
+            limit: Iterations at most.
+            goal: Give up, with None, when it is plain that this plan will not be reached.
+        """
         c, step, path = self._condensed, self.step, nominal.states[1:] - self.step.x_ref[1:]
         p = path[:, self._problem.model.position]
         y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
-        near = touched = _touched(nominal, step.count)
+        near = touched = nominal.touched[: step.count]
         bounds, total = self._active_bounds(nominal), 0
         while True:
             more = step.within(self._path(y), y[c.s], _NEAR)
@@ -98,7 +148,7 @@ class CondensedSCP:
                 near = np.ones_like(near)
             conflicts = Conflicts(step, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
-            end = self._converge(conflicts, y, active, limit - total)
+            end = self._converge(conflicts, y, active, limit - total, goal)
             if end is None:
                 return None
             point, active, cap, iterations = end
@@ -107,16 +157,23 @@ class CondensedSCP:
             missed = step.within(self._path(y), y[c.s], 0.0, known=near)
             if missed is None or total >= limit:
                 return self._ended(point, cap, total)
-            touched = conflicts.table(active[len(bounds) :], *near.shape) < 0
+            touched = conflicts.table(active[len(bounds) :], 0.0, *near.shape) < 0
 
     def _converge(
-        self, conflicts: Conflicts, y: FloatArray, active: IntArray, limit: int
+        self,
+        conflicts: Conflicts,
+        y: FloatArray,
+        active: IntArray,
+        limit: int,
+        goal: Descent | None,
     ) -> tuple[Point, IntArray, float, int] | None:
         """Repeat convex step, summed step and certificate about some pairs."""
         tangent, cap, before, point = conflicts.tangent(y), np.inf, np.inf, None
         bold = True
         for iteration in range(1, limit + 1):
             held = self._convex(conflicts, tangent, active, cap)
+            if held is None and goal is not None and goal.status.ok:
+                return None  # a plan with slack never beats one without
             if held is None and cap == np.inf:
                 cap = self._problem.slack_weight  # nobody found a plan within all half-spaces
                 held = self._convex(conflicts, tangent, active, cap)
@@ -126,8 +183,14 @@ class CondensedSCP:
             ahead = self._summed(conflicts, tangent, held) if bold else None
             point = self._certified(conflicts, ahead or held)
             residual = point.residuals.worst
-            if residual <= self._tolerance:
+            certified = residual <= self._tolerance
+            if residual <= _SURPLUS * self._tolerance or (certified and before <= self._tolerance):
                 break
+            if goal is not None and (
+                hopeless(iteration, point.cost, goal)
+                or self._arrives(point, goal)
+            ):
+                return None
             bold = ahead is None or residual < before / 2
             before, tangent = residual, point.pushed.tangent
         return None if point is None else (point, active, cap, iteration)
@@ -162,6 +225,17 @@ class CondensedSCP:
         turned = np.einsum("kwm,kw->km", L, moved[conflicts.at[pairs]])
         bold = summed(held, bends.reshape(-1, bends.shape[-1]), turned.ravel())
         return bold if bold is not None and bold.consistent(_ROUNDING) else None
+
+    def _arrives(self, point: Point, goal: Descent) -> bool:
+        """Whether a point is about to end where the goal is: at its cost, and the same way."""
+        if abs(point.cost - goal.cost) > _ALIKE * goal.cost or point.pushed is None:
+            return False
+        count, horizon = self.step.count, self._problem.horizon
+        position = self._problem.model.position
+        forces = point.pushed.conflicts.table(point.pushed.force, 0.0, count, horizon)
+        mine = Passing(self._path(point.y)[1:], forces > _NEGLIGIBLE)
+        theirs = Passing(goal.iterate.states[1:, position], goal.iterate.touched[:count])
+        return same_way(self.step, mine, theirs)
 
     def _within_bounds(self) -> tuple[FloatArray, FloatArray]:
         """The free plan's y and the forces of its bounds."""
@@ -243,12 +317,3 @@ class CondensedSCP:
             slack,
             Multipliers(point.costates, -inputs, margin, -forces, pins),
         ).frozen()
-
-
-def _touched(nominal: Iterate, count: int) -> BoolArray:
-    """Which obstacles push a nominal plan, at which stages: (J, N)."""
-    duals = nominal.multipliers
-    if duals is None:
-        return np.zeros((count, nominal.slack.shape[1]), dtype=np.bool_)
-    touched: BoolArray = duals.obstacles[:count] < -_NEGLIGIBLE
-    return touched

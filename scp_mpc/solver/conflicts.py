@@ -68,6 +68,26 @@ class Conflicts:
         self._reference = step.x_ref[1:, position]
         self._now = step.x0[position]
 
+    def about(self, paths: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Linearise about several paths (C, N+1, d) at sizes s (M,) at once.
+
+        Returns:
+            Gradients a (C, K, w) and right-hand sides b (C, K) of a' (p, s) >= b, where p is the
+            deviation from the reference.
+        """
+        count, K = len(paths), len(self.stage)
+        tiled = self._sets.taken(np.tile(np.arange(K), count))
+        positions = paths[:, self.stage + 1]
+        before = paths[:, self.stage] - self._means_before
+        d = positions.shape[-1]
+        sizes = np.tile(s[self.obstacle], count)
+        spaces = self._step.problem.no_go.linearise(
+            tiled, positions.reshape(-1, 1, d), sizes, before.reshape(-1, d)
+        )
+        normal = spaces.normal.reshape(count, K, d)
+        b = spaces.offset.reshape(count, K) - (normal * self._reference[self.stage]).sum(axis=2)
+        return np.concatenate([normal, spaces.slope.reshape(count, K, 1)], axis=2), b
+
     def positions(self, y: FloatArray) -> FloatArray:
         """(N+1, d) of the robot, from now on [m]."""
         path = np.empty((len(self._reference) + 1, len(self._now)))

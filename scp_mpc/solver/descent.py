@@ -4,9 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+from scp_mpc.arrays import BoolArray
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
+
+_PATIENCE = 3  # iterations before a rival is given up
+_FAR = 1.1  # share of the goal's merit above which it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,34 @@ class Descent:
         if self.status.ok != other.status.ok:
             return self.status.ok
         return self.merit < other.merit - lead
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """What one program about a path leads to.
+
+    Attributes:
+        merit: Cost and penalty on the slack; infinite if there is no solution without slack.
+        touched: (J, N) which obstacles push it, at which stages.
+        make: Makes the iterate.
+    """
+
+    merit: float
+    touched: BoolArray
+    make: Callable[[], Iterate]
+
+    @cached_property
+    def iterate(self) -> Iterate:
+        """Where to descend from."""
+        return self.make()
+
+
+def hopeless(iterations: int, merit: float, goal: Descent) -> bool:
+    """Whether a descent is so far above a goal, after so many iterations, that it will not beat it.
+
+    The cost falls from one subproblem to the next, by less each time.
+    """
+    return goal.status.ok and iterations >= _PATIENCE and merit > _FAR * goal.merit
 
 
 def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:

@@ -5,11 +5,11 @@ Notation:
     U (N, nu)       inputs              slack   (M, N)  violation per obstacle and stage [m]
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.robots.linear import LinearModel
 
 _NEGLIGIBLE = 1e-6  # [cost / m]; an interior-point solver leaves no multiplier exactly zero
@@ -60,6 +60,14 @@ class Iterate:
         duals = self.multipliers
         return duals is None or bool((duals.obstacles < -_NEGLIGIBLE).any())
 
+    @property
+    def touched(self) -> BoolArray:
+        """Which obstacles push this point, at which stages: (M, N)."""
+        duals = self.multipliers
+        if duals is None:
+            return np.zeros(self.slack.shape, dtype=np.bool_)
+        return duals.obstacles < -_NEGLIGIBLE
+
     def frozen(self) -> "Iterate":
         """Mark the primal arrays read-only: a plan shares them with the next step's guess."""
         for array in (self.states, self.inputs, self.s, self.slack):
@@ -76,6 +84,13 @@ class Iterate:
             _shifted(self.slack, 1),
             None if self.multipliers is None else self.multipliers.shifted(),
         )
+
+
+def moved(iterate: Iterate, position: IntArray, path: FloatArray) -> Iterate:
+    """An iterate's inputs and sizes about another path (N, d); it need not obey the dynamics."""
+    states = iterate.states.copy()
+    states[1:, position] = path
+    return replace(iterate, states=states)
 
 
 def _shifted(values: FloatArray, axis: int) -> FloatArray:

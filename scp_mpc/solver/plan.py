@@ -45,14 +45,15 @@ class Candidate:
     Attributes:
         obstacle: Index of the obstacle that it was to pass on another side.
         side: (d,) direction from the obstacle to where it passes.
-        cost: Of the plan that came of it, slack not included.
-        status: How that ended.
+        time: Stages by which it was to pass earlier than the plan that ignores the obstacles.
+        merit: Of the first program about it: cost and penalty on slack; infinite if that program
+            has no solution without slack.
     """
 
     obstacle: int
     side: FloatArray
-    cost: float
-    status: Status
+    time: float
+    merit: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,11 @@ settings say so, they run on the sparse one (`sparse_scp.py`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from threading import Lock
 
 from numpy.typing import ArrayLike
 
+from scp_mpc.arrays import BoolArray
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -26,16 +26,14 @@ from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Candidate, Plan, Timing
-from scp_mpc.solver.sides import along, candidates
+from scp_mpc.solver.sides import Passing, candidates, same_way
 from scp_mpc.solver.sparse_scp import SparseSCP
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 from scp_mpc.trajectory import Trajectory
 
-# A rival must win this share of what it could win at most, or the plan flickers between sides.
-_HYSTERESIS = 0.05
-# Subproblems after which a rival must be ahead; costs fall from one to the next, so it is fair.
-_EXPLORATION = 5
+# A rival must be better by this share, or the plan flickers between sides of equal cost.
+_HYSTERESIS = 0.001
 
 
 class SCP:
@@ -121,17 +119,17 @@ class SCP:
         best = self._engine.unhindered()
         if best is None:
             start = self._engine.free() if nominal is None else nominal()
-            best = self._descend(start, self.settings.max_iterations)
+            best = self._descend(start)
             wanted = not best.status.ok or (challenge and best.iterate.touches)
             if self.settings.sides and wanted:
                 best, tried, switched = self._challenge(step, best)
         return self._plan(step, best, tried, switched, watch)
 
-    def _descend(self, nominal: Iterate, limit: int) -> Descent:
+    def _descend(self, nominal: Iterate) -> Descent:
         """Descend on the condensed problem; on the sparse one where that has no answer."""
+        limit = self.settings.max_iterations
         best = self._engine.descend(nominal, limit)
-        explored = limit < self.settings.max_iterations
-        if best is not None and (explored or best.status.certified or self._engine is self._sparse):
+        if best is not None and (best.status.certified or self._engine is self._sparse):
             return best
         self._sparse.begin(self._engine.step, self._engine.watch)
         other = self._sparse.descend(nominal, limit)
@@ -140,25 +138,27 @@ class SCP:
     def _challenge(
         self, step: StepData, best: Descent
     ) -> tuple[Descent, tuple[Candidate, ...], bool]:
-        """Try the other sides, if there is something to win."""
+        """Rank the ways past the obstacles by one program each; descend from the best of them."""
         free = self._engine.free()
-        cost = self.problem.cost(free.states, free.inputs, free.s, step.x_ref)
-        most = best.merit - cost  # no plan costs less than the free one
-        if most <= _HYSTERESIS * best.merit:
-            return best, (), False
-        tried, rival = [], None
-        for side in candidates(step, free.states[1:, self.problem.model.position], free.s):
-            other = self._descend(along(free, self.problem, side.path), _EXPLORATION)
-            tried.append(Candidate(side.obstacle, side.normal, other.cost, other.status))
-            if rival is None or other.beats(rival, lead=0.0):
-                rival = other
-        if rival is None or not rival.beats(best, _HYSTERESIS * most):
-            return best, tuple(tried), False
-        if not rival.status.certified:
-            refined = self._descend(rival.iterate, self.settings.max_iterations)
-            refined = replace(refined, iterations=rival.iterations + refined.iterations)
-            rival = rival if rival.beats(refined, lead=0.0) else refined
-        return rival, tuple(tried), True
+        sides = candidates(step, free.states[1:, self.problem.model.position], free.s)
+        starts = self._engine.glimpses(free, [side.path for side in sides])
+        tried = tuple(
+            Candidate(side.obstacle, side.normal, side.time, start.merit)
+            for side, start in zip(sides, starts, strict=True)
+        )
+        here = self._passing(best.iterate, best.iterate.touched[: step.count])
+        goal, switched = best, False
+        ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
+        for start in ranked[: self.settings.rivals]:
+            if best.status.ok and same_way(step, self._passing(start.iterate, start.touched), here):
+                continue  # this way leads to where we are
+            rival = self._engine.descend(start.iterate, self.settings.max_iterations, goal)
+            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = rival, True
+        return goal, tried, switched
+
+    def _passing(self, iterate: Iterate, touched: BoolArray) -> Passing:
+        return Passing(iterate.states[1:, self.problem.model.position], touched)
 
     def _plan(
         self,

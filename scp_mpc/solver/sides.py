@@ -1,91 +1,131 @@
-"""Candidates that pass an obstacle on either side.
+"""Candidates that pass an obstacle on its other sides, or one stage earlier or later.
 
-One linearisation keeps to one side; a plan that trails behind an obstacle is a local optimum. A
-candidate is a path that need not obey the dynamics: where the plan that ignores the obstacles
-would enter a no-go set, it is moved to the point of the exact inflation's boundary whose normal is
-square to the relative motion. For an obstacle that crosses, these are before it and behind it.
-Linearising about the path gives half-spaces on that side, sound as any.
+One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
+of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
+late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that
+ignores the obstacles, put off or brought forward by one stage of the relative motion, and pushed
+out of the no-go set square to that motion. For an obstacle that crosses, the two sides are before
+it and behind it. Linearising about the path gives half-spaces on that side, sound as any.
 
 Notation:
     p       (N, d)      positions of the plan that ignores the obstacles
-    v       (d,)        motion relative to the obstacle over the conflict
+    v       (d,)        motion relative to the obstacle in one stage, over the conflict [m]
     n       (d,)        side: a unit vector square to v
+    tau                 stages by which the candidate passes later (negative) or earlier
+    e       (N, d)      semi-axes s sigma + r; w and m are offset and n in units of them
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.problem import Problem
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.solver.step_data import StepData
 
-
-MAX_CANDIDATES = 4  # in one control step, whatever the number of obstacles
+MAX_CANDIDATES = 12  # in one control step, whatever the number of obstacles
+_COSINE = 0.9  # of the angle between two directions that count as one side
+_TIMES = (0.0, -1.0, 1.0)  # tau: as the free plan would, one stage later, one earlier
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """Where to pass which obstacle.
+    """Where and when to pass which obstacle.
 
     Attributes:
         obstacle: Its index.
         normal: (d,) from the obstacle to where the path passes.
+        time: Stages by which it passes earlier than the free plan would.
         path: (N, d) positions to linearise about.
     """
 
     obstacle: int
     normal: FloatArray
+    time: float
     path: FloatArray
 
 
-def candidates(
-    step: StepData, path: FloatArray, s: FloatArray, limit: int = MAX_CANDIDATES
-) -> list[Side]:
-    """Return the sides of the obstacles in conflict, the first conflict first; none without any.
+@dataclass(frozen=True, eq=False)
+class Passing:
+    """How a plan passes the obstacles.
+
+    Attributes:
+        path: (N, d) its positions.
+        touched: (J, N) which obstacles push it, at which stages.
+    """
+
+    path: FloatArray
+    touched: BoolArray
+
+
+def candidates(step: StepData, path: FloatArray, s: FloatArray) -> list[Side]:
+    """Return the ways past the obstacles in conflict, the first conflict first; none without any.
+
+    With several obstacles in conflict, each candidate moves away from one of them; from the
+    others it is pushed by the descent.
 
     Args:
         step: The control step.
         path: (N, d) positions of the plan that ignores the obstacles.
         s: (M,) sizes of the ellipsoids.
-        limit: How many at most.
     """
     conflict = step.conflicts(path, s)
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
-    found: list[Side] = []
-    for j in np.argsort(first, kind="stable")[: np.count_nonzero(first < conflict.shape[1])]:
-        stages = np.flatnonzero(conflict[j])
-        for n in _normals(path - step.means[j, 1:], stages):
-            moved = path.copy()
-            moved[stages] = _boundary_points(step, float(s[j]), int(j), stages, n)
-            found.append(Side(int(j), n, moved))
-        if len(found) >= limit:
-            break
-    return found[:limit]
+    count = np.count_nonzero(first < conflict.shape[1])
+    order = np.argsort(first, kind="stable")[:count].tolist()
+    ways = (side for j in order for side in _ways(step, path, float(s[j]), j, conflict[j]))
+    return list(islice(ways, MAX_CANDIDATES))
 
 
-def along(free: Iterate, problem: Problem, path: FloatArray) -> Iterate:
-    """The free plan, moved to a path (N, d)."""
-    states = free.states.copy()
-    states[1:, problem.model.position] = path
-    return replace(free, states=states)
+def same_way(step: StepData, first: Passing, second: Passing) -> bool:
+    """Whether two plans are pushed by the same obstacles at the same stages on the same side."""
+    if not np.array_equal(first.touched, second.touched):
+        return False
+    j, i = np.nonzero(first.touched)
+    a, b = (passing.path[i] - step.means[j, i + 1] for passing in (first, second))
+    apart = (a * b).sum(axis=1) < _COSINE * np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    return not apart.any()
 
 
-def _normals(relative: FloatArray, stages: IntArray) -> list[FloatArray]:
+def _ways(
+    step: StepData, path: FloatArray, s: float, j: int, conflict: BoolArray
+) -> Iterator[Side]:
+    v, normals = _directions(path - step.means[j, 1:], np.flatnonzero(conflict))
+    ellipsoid = _Ellipsoids.of(step, s, j)
+    for time in _TIMES:
+        for n in normals:
+            yield Side(j, n, time, ellipsoid.pushed(path + time * v, n))
+
+
+def _directions(relative: FloatArray, stages: IntArray) -> tuple[FloatArray, list[FloatArray]]:
     begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(relative) - 1)
-    v = relative[end] - relative[begin]
+    v = (relative[end] - relative[begin]) / max(end - begin, 1)
     if not v.any():
         v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
     square = np.linalg.svd(v[None])[2][1:]
-    return [sign * n for n in square for sign in (1.0, -1.0)]
+    return v, [sign * n for n in square for sign in (1.0, -1.0)]
 
 
-def _boundary_points(
-    step: StepData, s: float, j: int, stages: IntArray, n: FloatArray
-) -> FloatArray:
-    """Boundary points of ellipsoid (+) ball with outward normal n: mu + s Sigma n / |.| + r n."""
-    pull = step.covariances[j, stages + 1] @ n
-    half_width = np.sqrt(np.maximum(pull @ n, 0.0))[:, None]
-    return step.means[j, stages + 1] + s * pull / np.maximum(half_width, 1e-12) + step.radii[j] * n
+@dataclass(frozen=True, eq=False)
+class _Ellipsoids:
+    """One obstacle's ellipsoids at stages 1 .. N, their axes lengthened by the radii."""
+
+    means: FloatArray
+    scaling: FloatArray  # (N, d, d) takes offsets to units of the semi-axes
+
+    @classmethod
+    def of(cls, step: StepData, s: float, j: int) -> "_Ellipsoids":
+        variances, rotations = np.linalg.eigh(step.covariances[j, 1:])
+        e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + step.radii[j], 1e-9)
+        return cls(step.means[j, 1:], np.swapaxes(rotations, 1, 2) / e[..., None])
+
+    def pushed(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move the points of a path (N, d) that lie within along n to the boundary."""
+        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
+        m = self.scaling @ n
+        mm, wm = (m * m).sum(axis=1), (w * m).sum(axis=1)
+        room = 1 - (w * w).sum(axis=1)  # positive inside
+        shift = np.where(room > 0, (np.sqrt(wm**2 + mm * np.maximum(room, 0.0)) - wm) / mm, 0.0)
+        return path + shift[:, None] * n

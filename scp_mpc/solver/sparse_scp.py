@@ -11,15 +11,17 @@ residual, and a step without an active obstacle takes one QP.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
+from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.settings import Settings
 from scp_mpc.solver.acceleration import Anderson
-from scp_mpc.solver.descent import Descent, judge
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.descent import Descent, Glimpse, hopeless, judge
+from scp_mpc.solver.iterate import Iterate, moved
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
 from scp_mpc.solver.step_data import StepData
@@ -77,8 +79,26 @@ class SparseSCP:
         nominal = self._subproblem.resting(self.step.x_ref)
         return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
 
-    def descend(self, nominal: Iterate, limit: int) -> Descent:
-        """Run the loop from one nominal plan, for at most `limit` subproblems."""
+    def glimpses(self, free: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
+        """Solve one program about each path (N, d)."""
+        ends = [self.descend(moved(free, self._problem.model.position, path), 1) for path in paths]
+        return [
+            Glimpse(
+                end.merit if end.status.ok else np.inf,
+                end.iterate.touched[: self.step.count],
+                lambda end=end: end.iterate,
+            )
+            for end in ends
+        ]
+
+    def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
+        """Run the loop from one nominal plan, for at most `limit` subproblems.
+
+        Args:
+            nominal: Where to begin.
+            limit: Subproblems at most.
+            goal: Give up, with None, when it is plain that this plan will not be reached.
+        """
         tolerance = self._settings.tolerance
         self._subproblem.soft = False
         iterate, iterations = self._subproblem.started(nominal), 0
@@ -89,6 +109,8 @@ class SparseSCP:
             if convex is None:
                 break
             iterate, iterations = convex, iterations + 1
+            if goal is not None and hopeless(iterations, self._merit(iterate), goal):
+                return None
             if self._settings.acceleration:
                 acceleration.learn(iterate)
             residuals = self._linearise_about(iterate)
