@@ -3,8 +3,9 @@
     minimise |v|^2 / 2   subject to   lower <= F v <= upper,   A v >= b
 
 From the active set of the last plan a dual active-set method needs one or two changes, each a
-rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). What it returns is
-taken only as a guess of the active set: `settle` then solves for exactly that set.
+rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). Bounds that neither
+the guess nor the free plan touches are left out until a solution breaks them. What DAQP returns is
+taken only as a guess of the active set: `_settled` then solves for exactly that set.
 
 Notation:
     v       (nv,)       inputs and sizes in coordinates that make the Hessian the identity
@@ -13,38 +14,48 @@ Notation:
 """
 
 from dataclasses import dataclass
+from itertools import count
 
 import daqp
 import numpy as np
-from scipy.linalg.lapack import dposv
+from scipy.linalg.lapack import dposv, dpotrf
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 
-_LOWER, _UPPER, _SOFT = 3, 1, 8  # DAQP's flags of a constraint: active at a bound, may yield
+_LOWER, _SOFT = 3, 8  # DAQP's flags of a constraint: active at its lower bound, may yield
 _SOLVED = (1, 2)  # DAQP's exit flags: optimal, optimal with slack
-_FAR = 1e30  # DAQP's infinity
+_INFINITY = 1e30  # DAQP's own
 _YIELDING = 1e6  # metres per unit force beyond the cap: as good as a pure L1 penalty
 _ACCURACY = 1e-9  # of a constraint, in its own unit
+_FEW = 4  # variables per row beyond which a program is solved in the span of its rows
+_ATTEMPTS = 3  # programs with ever more bounds before all of them are taken
 _RIDGE = 1e-12  # relative to the largest diagonal entry
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedProgram:
-    """minimise |v|^2 / 2 subject to least <= rows v <= most: bounds first, then half-spaces."""
+    """The values of one program.
 
-    rows: FloatArray
-    least: FloatArray
-    most: FloatArray
+    Attributes:
+        lower: (nf,) bounds of F v.
+        upper: (nf,) likewise.
+        A: (K, nv) half-spaces.
+        b: (K,) their right-hand sides.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    A: FloatArray
+    b: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Point, forces and active set of a condensed program.
+    """Point, forces and active set of a program; bounds first, then half-spaces.
 
     Attributes:
-        program: The program.
         v: (nv,) point.
-        force: (nf + K,) on the bounds, positive at lower ones, then on the half-spaces, >= 0.
+        force: (nf + K,) positive at lower bounds and half-spaces.
         active: (nf + K,) -1 at a lower bound or half-space, 1 at an upper bound, 0 elsewhere.
         capped: (nf + K,) half-spaces that yield at the largest force.
         rows: (k, nv) responses of the active constraints that hold with equality.
@@ -52,7 +63,6 @@ class Held:
         factor: (k, k) upper Cholesky factor of rows rows'.
     """
 
-    program: CondensedProgram
     v: FloatArray
     force: FloatArray
     active: IntArray
@@ -61,120 +71,164 @@ class Held:
     indices: IntArray
     factor: FloatArray
 
-    def consistent(self, tolerance: float) -> bool:
-        """Whether all forces push the right way and all constraints that do not yield hold."""
-        if (self.force * self.active > 0).any():
-            return False
-        program, value = self.program, self.program.rows @ self.v
-        low = (value < program.least - tolerance) & ~self.capped
-        return not (low.any() or (value > program.most + tolerance).any())
-
 
 class ActiveSetSolver:
-    """Solves condensed programs with constant bounds and changing half-spaces.
+    """Solves condensed programs.
 
     Args:
         F: (nf, nv) responses of the bounded entries.
     """
 
     def __init__(self, F: FloatArray) -> None:
-        """Allocate room for the constraints."""
-        self._bounds, n = F.shape
-        self._rows = np.ascontiguousarray(F)
-        self._identity, self._zero = np.eye(n), np.zeros(n)
+        """Prepare what all programs share."""
+        self._F = np.ascontiguousarray(F)
+        self._identity, self._zero = np.eye(F.shape[1]), np.zeros(F.shape[1])
 
     def solve(
-        self,
-        lower: FloatArray,
-        upper: FloatArray,
-        A: FloatArray,
-        b: FloatArray,
-        active: IntArray,
-        cap: float = np.inf,
+        self, program: CondensedProgram, active: IntArray, cap: float = np.inf
     ) -> Held | None:
         """Solve, beginning at an active set; None if there is no point, or no solution came.
 
         Args:
-            lower: (nf,) bounds of F v.
-            upper: (nf,) likewise.
-            A: (K, nv) half-spaces.
-            b: (K,) their right-hand sides.
+            program: The program.
             active: (nf + K,) guess of the active set.
             cap: Largest force on a half-space; finite where they may yield.
         """
-        program = CondensedProgram(
-            np.concatenate([self._rows, A]) if len(A) else self._rows,
-            np.concatenate([lower, b]),
-            np.concatenate([upper, np.full(len(b), _FAR)]),
-        )
-        sense = np.where(active < 0, _LOWER, active).astype(np.intc)
-        if np.isfinite(cap):
-            flag, force = self._yielding(program, sense, cap)
-        else:
-            _, _, flag, info = daqp.solve(
-                self._identity,
-                self._zero,
-                program.rows,
-                program.most,
-                program.least,
-                sense,
-                primal_tol=_ACCURACY,
-            )
-            force = -info["lam"]
-        if flag not in _SOLVED:
+        end = self._search(program, active, cap)
+        if end is None:
             return None
+        force = end[1]
         capped = np.zeros(len(force), dtype=np.bool_)
-        capped[self._bounds :] = force[self._bounds :] >= cap
-        return settle(program, -np.sign(force).astype(np.intc), capped, cap)
+        if np.isfinite(cap):
+            capped[len(self._F) :] = force[len(self._F) :] >= cap
+        return self._settled(program, np.sign(-force).astype(np.intp), capped, cap)
 
     def glimpse(
-        self, lower: FloatArray, upper: FloatArray, A: FloatArray, b: FloatArray
+        self, program: CondensedProgram, active: IntArray
     ) -> tuple[FloatArray, BoolArray] | None:
-        """Solve without a guess; return v (nv,) and which half-spaces (K,) push, or None."""
-        rows = np.concatenate([self._rows, A])
-        least, most = np.concatenate([lower, b]), np.concatenate([upper, np.full(len(b), _FAR)])
-        v, _, flag, info = daqp.solve(self._identity, self._zero, rows, most, least)
-        return (v, info["lam"][self._bounds :] != 0) if flag in _SOLVED else None
+        """Return only v (nv,) and which half-spaces (K,) push, or None.
 
-    def _yielding(
-        self, program: CondensedProgram, sense: IntArray, cap: float
-    ) -> tuple[int, FloatArray]:
-        """Let the half-spaces yield at the force `cap`."""
-        sense[self._bounds :] |= _SOFT
-        model = daqp.Model()
-        model.setup(
-            self._identity, self._zero, program.rows, program.most, program.least, sense
+        Args:
+            program: The program.
+            active: (nf,) guess of the active bounds.
+        """
+        guess = np.concatenate([active, np.zeros(len(program.b), dtype=np.intp)])
+        end = self._search(program, guess, np.inf)
+        return None if end is None else (end[0], end[1][len(self._F) :] > 0)
+
+    def consistent(self, program: CondensedProgram, held: Held, tolerance: float) -> bool:
+        """Whether all forces push the right way and all constraints that do not yield hold."""
+        if (held.force * held.active > 0).any():
+            return False
+        bounded, gap = self._F @ held.v, program.A @ held.v - program.b
+        return not (
+            (bounded < program.lower - tolerance).any()
+            or (bounded > program.upper + tolerance).any()
+            or ((gap < -tolerance) & ~held.capped[len(self._F) :]).any()
         )
-        model.settings = {"primal_tol": _ACCURACY}
-        weight = np.full(len(program.rows), cap)
-        softness = np.full(len(program.rows), _YIELDING)
-        model.soft_weights(softness, softness, weight, weight)
-        _, _, flag, info = model.solve()
-        return flag, -info["lam"]
 
-
-def settle(
-    program: CondensedProgram, active: IntArray, capped: BoolArray, cap: float
-) -> Held | None:
-    """Solve for exactly this active set; None if its rows depend on each other."""
-    rows = program.rows
-    v, force = np.zeros(rows.shape[1]), np.zeros(len(rows))
-    if capped.any():
-        force[capped] = cap
-        v = cap * rows[capped].sum(axis=0)
-        indices = np.flatnonzero((active != 0) & ~capped)
-    else:
-        indices = active.nonzero()[0]
-    own, factor = rows[indices], np.zeros((0, 0))
-    if len(indices):
-        wanted = np.where(active < 0, program.least, program.most)[indices] - own @ v
-        factor, strength, info = dposv(own @ own.T, wanted)
-        if info != 0:  # two rows may be the same
-            gram = own @ own.T
-            gram.flat[:: len(gram) + 1] += _RIDGE * gram.diagonal().max()
-            factor, strength, info = dposv(gram, wanted)
-            if info != 0:
+    def _search(
+        self, program: CondensedProgram, active: IntArray, cap: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that turn out to matter."""
+        nf, K = len(self._F), len(program.b)
+        lower, upper = program.lower, program.upper
+        within = (active[:nf] != 0) | (lower > 0) | (upper < 0)
+        sense = np.where(active < 0, _LOWER, active).astype(np.intc)
+        if np.isfinite(cap):
+            sense[nf:] |= _SOFT
+        for attempt in count():
+            if attempt == _ATTEMPTS:
+                within[:] = True
+            which = within.nonzero()[0]
+            if not len(which) + K:
+                return self._zero, np.zeros(nf)
+            rows = np.concatenate([self._F[which], program.A])
+            least = np.concatenate([lower[which], program.b])
+            most = np.concatenate([upper[which], np.full(K, _INFINITY)])
+            flags = np.concatenate([sense[which], sense[nf:]])
+            end = self._run(rows, least, most, flags, cap)
+            if end is None:
                 return None
-        force[indices] = strength
-        v = v + strength @ own
-    return Held(program, v, force, active, capped, own, indices, factor)
+            v, given = end
+            bounded = self._F @ v
+            broken = (bounded < lower - _ACCURACY) | (bounded > upper + _ACCURACY)
+            broken &= ~within
+            if not broken.any():
+                force = np.zeros(nf + K)
+                force[which], force[nf:] = given[: len(which)], given[len(which) :]
+                return v, force
+            within |= broken
+            sense[which], sense[nf:] = _signs(given[: len(which)]), _signs(given[len(which) :])
+            if np.isfinite(cap):
+                sense[nf:] |= _SOFT
+        raise AssertionError  # unreachable: with all bounds none is broken
+
+    def _run(
+        self, rows: FloatArray, least: FloatArray, most: FloatArray, sense: IntArray, cap: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Let DAQP solve with these rows; return v and their forces."""
+        wide = rows
+        if _FEW * len(rows) < rows.shape[1]:
+            # v lies in the span of few rows: solve in coordinates of an orthonormal basis of it.
+            rows = _triangle(rows)
+        n = rows.shape[1]
+        identity = self._identity if rows is wide else np.eye(n)  # DAQP ignores strides
+        zero = self._zero[:n]
+        if np.isfinite(cap):
+            model = daqp.Model()
+            model.setup(identity, zero, rows, most, least, sense)
+            model.settings = {"primal_tol": _ACCURACY}
+            weight, softness = np.full(len(rows), cap), np.full(len(rows), _YIELDING)
+            model.soft_weights(softness, softness, weight, weight)
+            v, _, flag, info = model.solve()
+        else:
+            v, _, flag, info = daqp.solve(
+                identity, zero, rows, most, least, sense, primal_tol=_ACCURACY
+            )
+        if flag not in _SOLVED:
+            return None
+        force = -info["lam"]
+        return (v if rows is wide else force @ wide), force
+
+    def _settled(
+        self, program: CondensedProgram, active: IntArray, capped: BoolArray, cap: float
+    ) -> Held | None:
+        """Solve for exactly this active set; None if its rows depend on each other."""
+        nf = len(self._F)
+        v, force = np.zeros(len(self._zero)), np.zeros(len(active))
+        indices = active.nonzero()[0]
+        if capped.any():
+            force[capped] = cap
+            v = cap * program.A[capped[nf:]].sum(axis=0)
+            indices = (active * ~capped).nonzero()[0]
+        bounds, spaces = indices[indices < nf], indices[indices >= nf] - nf
+        rows, factor = np.concatenate([self._F[bounds], program.A[spaces]]), np.zeros((0, 0))
+        if len(indices):
+            at = np.where(active[bounds] < 0, program.lower[bounds], program.upper[bounds])
+            wanted = np.concatenate([at, program.b[spaces]]) - rows @ v
+            gram = rows @ rows.T
+            factor, strength, info = dposv(gram, wanted)
+            if info != 0:  # two rows may be the same
+                gram.flat[:: len(gram) + 1] += _RIDGE * gram.diagonal().max()
+                factor, strength, info = dposv(gram, wanted)
+                if info != 0:
+                    return None
+            force[indices] = strength
+            v = v + strength @ rows
+        return Held(v, force, active, capped, rows, indices, factor)
+
+
+def _triangle(rows: FloatArray) -> FloatArray:
+    """Lower triangle L (k, k) with L L' = rows rows': the same program in k variables."""
+    gram = rows @ rows.T
+    factor, info = dpotrf(gram, lower=1, clean=1)
+    if info != 0:  # two rows may be the same
+        gram.flat[:: len(gram) + 1] += _RIDGE * gram.diagonal().max()
+        factor, info = dpotrf(gram, lower=1, clean=1)
+    return np.ascontiguousarray(factor)
+
+
+def _signs(force: FloatArray) -> IntArray:
+    """DAQP's flags for constraints held by these forces."""
+    return np.where(force > 0, _LOWER, force < 0).astype(np.intc)

@@ -19,7 +19,7 @@ import numpy as np
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
-from scp_mpc.solver.active_set import ActiveSetSolver, Held
+from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram, Held
 from scp_mpc.solver.certificate import Certificate, Point, Pushed
 from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.conflicts import Conflicts, Tangent
@@ -30,8 +30,7 @@ from scp_mpc.solver.sides import Passing, same_way
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
-_NEAR = 0.5  # [m] beyond the no-go set; pairs farther off stay out of the program
-_WIDE = 1.0  # [m] likewise, for a first look at the ways past an obstacle
+_NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the program
 _NEGLIGIBLE = 1e-6  # [cost / m or unit of input] forces of the guess that are not active
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 _SURPLUS = 0.01  # of the tolerance: worth one more iteration, whose convergence is quadratic
@@ -55,6 +54,7 @@ class CondensedSCP:
         self._condensed = condensed
         self._certificate = Certificate(problem, condensed)
         self._qp = ActiveSetSolver(condensed.response[condensed.boxed])
+        self._least, self._most = condensed.lower[condensed.boxed], condensed.upper[condensed.boxed]
         self._none = np.zeros((0, condensed.response.shape[1])), np.zeros(0)
         self._relaxed = np.zeros(condensed.boxed.stop - condensed.boxed.start)
 
@@ -72,6 +72,8 @@ class CondensedSCP:
         self.finished: Counter[str] = Counter()
         with watch.solving:
             self._free = self._condensed.start(step.x0, step.x_ref)
+            box = self._free[self._condensed.boxed]
+            self._room = self._least - box, self._most - box
         self._bounded: tuple[FloatArray, FloatArray] | None = None
 
     def unhindered(self) -> Descent | None:
@@ -90,41 +92,54 @@ class CondensedSCP:
         point = self._certificate.certify(*self._certificate.rolled_out(y), reaction, None)
         return self._iterate(point, np.inf)
 
-    def glimpses(self, free: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
+    def glimpses(self, best: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
         """Solve one program about each path (N, d), all linearised at once.
 
-        A plan's cost is that of the plan that nothing constrains and |v|^2 / 2 more.
+        A plan costs |v|^2 / 2 more than the one that nothing constrains.
         """
         if not paths:
             return []
-        c, step, position = self._condensed, self.step, self._problem.model.position
-        whole = np.empty((len(paths), step.problem.horizon + 1, len(position)))
+        step, position = self.step, self._problem.model.position
+        whole = np.empty((len(paths), len(step.x_ref), len(position)))
         whole[:, 0], whole[:, 1:] = step.x0[position], paths
-        near = step.within(self._path(self._within_bounds()[0]), free.s, _WIDE)
-        conflicts = Conflicts(step, c, np.ones((step.count, len(paths[0])), bool) if near is None else near)
+        conflicts = Conflicts(step, self._condensed, self._near(whole, best.s))
         with self.watch.linearising:
-            a, b = conflicts.about(whole, free.s)
-        A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
-        b = b - (a * self._free[conflicts.at]).sum(axis=2)
-        box = self._free[c.boxed]
-        lower, upper = c.lower[c.boxed] - box, c.upper[c.boxed] - box
-        found, nobody = [], np.zeros((step.count, len(paths[0])), dtype=np.bool_)
-        for rows, least, path in zip(A, b, paths, strict=True):
-            with self.watch.inside:
-                end = self._qp.glimpse(lower, upper, rows, least)
-            if end is None:
-                found.append(Glimpse(np.inf, nobody, partial(moved, free, position, path)))
-            else:
-                self.finished["daqp"] += 1
-                v, pushing = end
-                touched = conflicts.table(pushing, 0.0, step.count, len(path)) > 0
-                found.append(Glimpse(float(v @ v) / 2, touched, partial(self._at, free, v)))
-        return found
+            a, b = conflicts.about(whole, best.s)
+        with self.watch.solving:
+            A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
+            b -= (a * self._free[conflicts.at]).sum(axis=2)
+        bounds = self._active_bounds(best)
+        return [
+            self._glimpse(self._program(rows, least), bounds, conflicts, best, path)
+            for rows, least, path in zip(A, b, paths, strict=True)
+        ]
 
-    def _at(self, free: Iterate, v: FloatArray) -> Iterate:
-        """An iterate at the outputs of v, without forces."""
-        path = self._path(self._free + self._condensed.response @ v)
-        return moved(free, self._problem.model.position, path[1:])
+    def _glimpse(
+        self,
+        program: CondensedProgram,
+        bounds: IntArray,
+        conflicts: Conflicts,
+        best: Iterate,
+        path: FloatArray,
+    ) -> Glimpse:
+        shape, position = (self.step.count, len(path)), self._problem.model.position
+        with self.watch.solving, self.watch.inside:
+            end = self._qp.glimpse(program, bounds)
+        if end is None:
+            return Glimpse(np.inf, np.zeros(shape, np.bool_), partial(moved, best, position, path))
+        self.finished["daqp"] += 1
+        v, pushing = end
+        seen = self._path(self._free + self._condensed.response @ v)[1:]
+        touched = conflicts.table(pushing, 0.0, *shape) > 0
+        return Glimpse(float(v @ v) / 2, touched, partial(moved, best, position, seen))
+
+    def _near(self, paths: FloatArray, s: FloatArray) -> BoolArray:
+        """Pairs that some path (C, N+1, d) or the free plan comes near to."""
+        near = np.zeros((self.step.count, self._problem.horizon), dtype=np.bool_)
+        for path in (*paths, self._path(self._within_bounds()[0])):
+            more = self.step.within(path, s, _NEAR, known=near)
+            near = near if more is None else near | more
+        return near if near.any() else ~near
 
     def descend(
         self, nominal: Iterate, limit: int, goal: Descent | None = None
@@ -145,7 +160,7 @@ class CondensedSCP:
             more = step.within(self._path(y), y[c.s], _NEAR)
             near = near if more is None else near | more
             if not near.any():
-                near = np.ones_like(near)
+                near = ~near
             conflicts = Conflicts(step, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
             end = self._converge(conflicts, y, active, limit - total, goal)
@@ -171,16 +186,18 @@ class CondensedSCP:
         tangent, cap, before, point = conflicts.tangent(y), np.inf, np.inf, None
         bold = True
         for iteration in range(1, limit + 1):
-            held = self._convex(conflicts, tangent, active, cap)
+            with self.watch.solving:
+                program = self._convex(conflicts, tangent)
+                held = self._solve(program, active, cap)
             if held is None and goal is not None and goal.status.ok:
                 return None  # a plan with slack never beats one without
             if held is None and cap == np.inf:
                 cap = self._problem.slack_weight  # nobody found a plan within all half-spaces
-                held = self._convex(conflicts, tangent, active, cap)
+                held = self._solve(program, active, cap)
             if held is None:
                 return None
             active = held.active
-            ahead = self._summed(conflicts, tangent, held) if bold else None
+            ahead = self._summed(conflicts, tangent, program, held) if bold else None
             point = self._certified(conflicts, ahead or held)
             residual = point.residuals.worst
             certified = residual <= self._tolerance
@@ -195,24 +212,25 @@ class CondensedSCP:
             before, tangent = residual, point.pushed.tangent
         return None if point is None else (point, active, cap, iteration)
 
-    def _convex(
-        self, conflicts: Conflicts, tangent: Tangent, active: IntArray, cap: float
-    ) -> Held | None:
-        """Solve the subproblem about a tangent."""
-        with self.watch.solving:
-            A = np.einsum("kw,kwn->kn", tangent.a, conflicts.response)
-            away = (tangent.y - self._free)[conflicts.at]
-            return self._solve(A, (tangent.a * away).sum(axis=1) - tangent.g, active, cap)
+    def _convex(self, conflicts: Conflicts, tangent: Tangent) -> CondensedProgram:
+        """The convex subproblem about a tangent."""
+        A = np.einsum("kw,kwn->kn", tangent.a, conflicts.response)
+        away = (tangent.y - self._free)[conflicts.at]
+        return self._program(A, (tangent.a * away).sum(axis=1) - tangent.g)
 
-    def _solve(self, A: FloatArray, b: FloatArray, active: IntArray, cap: float) -> Held | None:
-        c, free = self._condensed, self._free[self._condensed.boxed]
-        lower, upper = c.lower[c.boxed] - free, c.upper[c.boxed] - free
+    def _program(self, A: FloatArray, b: FloatArray) -> CondensedProgram:
+        """A program with the given half-spaces."""
+        return CondensedProgram(*self._room, A, b)
+
+    def _solve(self, program: CondensedProgram, active: IntArray, cap: float) -> Held | None:
         with self.watch.inside:
-            held = self._qp.solve(lower, upper, A, b, active, cap)
+            held = self._qp.solve(program, active, cap)
         self.finished["daqp"] += held is not None
         return held
 
-    def _summed(self, conflicts: Conflicts, tangent: Tangent, held: Held) -> Held | None:
+    def _summed(
+        self, conflicts: Conflicts, tangent: Tangent, program: CondensedProgram, held: Held
+    ) -> Held | None:
         """The sum of the convex steps to come, if there is one within the same constraints."""
         bounds = len(held.force) - len(tangent.g)
         pairs = np.flatnonzero(held.force[bounds:] > _NEGLIGIBLE)
@@ -224,7 +242,9 @@ class CondensedSCP:
         moved = self._free + self._condensed.response @ held.v - tangent.y
         turned = np.einsum("kwm,kw->km", L, moved[conflicts.at[pairs]])
         bold = summed(held, bends.reshape(-1, bends.shape[-1]), turned.ravel())
-        return bold if bold is not None and bold.consistent(_ROUNDING) else None
+        if bold is None or not self._qp.consistent(program, bold, _ROUNDING):
+            return None
+        return bold
 
     def _arrives(self, point: Point, goal: Descent) -> bool:
         """Whether a point is about to end where the goal is: at its cost, and the same way."""
@@ -241,12 +261,13 @@ class CondensedSCP:
         """The free plan's y and the forces of its bounds."""
         c, y = self._condensed, self._free
         if self._bounded is None:
-            box = y[c.boxed]
-            if (box >= c.lower[c.boxed]).all() and (box <= c.upper[c.boxed]).all():
+            if (self._room[0] <= 0).all() and (self._room[1] >= 0).all():
                 self.finished["kkt"] += 1
                 self._bounded = y, self._relaxed
             else:
-                held = self._solve(*self._none, self._relaxed.astype(np.intp), np.inf)
+                nobody = self._relaxed.astype(np.intp)
+                with self.watch.solving:
+                    held = self._solve(self._program(*self._none), nobody, np.inf)
                 self._bounded = (
                     (y, self._relaxed) if held is None else (y + c.response @ held.v, held.force)
                 )

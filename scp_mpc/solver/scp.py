@@ -12,6 +12,7 @@ settings say so, they run on the sparse one (`sparse_scp.py`).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from threading import Lock
 
 from numpy.typing import ArrayLike
@@ -140,13 +141,16 @@ class SCP:
     ) -> tuple[Descent, tuple[Candidate, ...], bool]:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
         free = self._engine.free()
-        sides = candidates(step, free.states[1:, self.problem.model.position], free.s)
-        starts = self._engine.glimpses(free, [side.path for side in sides])
+        here = self._passing(best.iterate, best.iterate.touched[: step.count])
+        sides = candidates(
+            step, free.states[1:, self.problem.model.position], here.path, free.s
+        )
+        present = replace(best.iterate, s=free.s)
+        starts = self._engine.glimpses(present, [side.path for side in sides])
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=True)
         )
-        here = self._passing(best.iterate, best.iterate.touched[: step.count])
         goal, switched = best, False
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
         for start in ranked[: self.settings.rivals]:

@@ -2,10 +2,11 @@
 
 One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
 of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
-late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that
-ignores the obstacles, put off or brought forward by one stage of the relative motion, and pushed
-out of the no-go set square to that motion. For an obstacle that crosses, the two sides are before
-it and behind it. Linearising about the path gives half-spaces on that side, sound as any.
+late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that ignores the
+obstacles; but during one conflict it is put off or brought forward by one stage of the relative
+motion and pushed out of the no-go set square to that motion, and during the other conflicts it is
+the present plan. For an obstacle that crosses, the two sides are before it and behind it.
+Linearising about the path gives half-spaces on that side, sound as any.
 
 Notation:
     p       (N, d)      positions of the plan that ignores the obstacles
@@ -25,6 +26,7 @@ from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.solver.step_data import StepData
 
 MAX_CANDIDATES = 12  # in one control step, whatever the number of obstacles
+_AROUND = 3  # stages before and after a conflict that a candidate may change
 _COSINE = 0.9  # of the angle between two directions that count as one side
 _TIMES = (0.0, -1.0, 1.0)  # tau: as the free plan would, one stage later, one earlier
 
@@ -59,23 +61,38 @@ class Passing:
     touched: BoolArray
 
 
-def candidates(step: StepData, path: FloatArray, s: FloatArray) -> list[Side]:
+def candidates(
+    step: StepData, free: FloatArray, present: FloatArray, s: FloatArray
+) -> list[Side]:
     """Return the ways past the obstacles in conflict, the first conflict first; none without any.
-
-    With several obstacles in conflict, each candidate moves away from one of them; from the
-    others it is pushed by the descent.
 
     Args:
         step: The control step.
-        path: (N, d) positions of the plan that ignores the obstacles.
+        free: (N, d) positions of the plan that ignores the obstacles.
+        present: (N, d) positions of the best plan so far.
         s: (M,) sizes of the ellipsoids.
     """
-    conflict = step.conflicts(path, s)
+    conflict = step.conflicts(free, s)
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
     count = np.count_nonzero(first < conflict.shape[1])
     order = np.argsort(first, kind="stable")[:count].tolist()
-    ways = (side for j in order for side in _ways(step, path, float(s[j]), j, conflict[j]))
+    ways = (
+        side
+        for j in order
+        for side in _ways(step, free, _elsewhere(free, present, conflict, j), float(s[j]), j, conflict[j])
+    )
     return list(islice(ways, MAX_CANDIDATES))
+
+
+def _elsewhere(free: FloatArray, present: FloatArray, conflict: BoolArray, j: int) -> FloatArray:
+    """The free plan, and the present one during all conflicts but the first with obstacle j."""
+    others = conflict.copy()
+    others[j, _first_run(conflict[j])] = False
+    stages = np.flatnonzero(others.any(axis=0))
+    around = (stages[:, None] + np.arange(-_AROUND, _AROUND + 1)).clip(0, len(free) - 1)
+    path = free.copy()
+    path[around] = present[around]
+    return path
 
 
 def same_way(step: StepData, first: Passing, second: Passing) -> bool:
@@ -89,13 +106,29 @@ def same_way(step: StepData, first: Passing, second: Passing) -> bool:
 
 
 def _ways(
-    step: StepData, path: FloatArray, s: float, j: int, conflict: BoolArray
+    step: StepData,
+    free: FloatArray,
+    elsewhere: FloatArray,
+    s: float,
+    j: int,
+    conflict: BoolArray,
 ) -> Iterator[Side]:
-    v, normals = _directions(path - step.means[j, 1:], np.flatnonzero(conflict))
-    ellipsoid = _Ellipsoids.of(step, s, j)
+    stages = _first_run(conflict)
+    v, normals = _directions(free - step.means[j, 1:], stages)
+    reach = slice(max(stages[0] - _AROUND, 0), stages[-1] + _AROUND + 1)
+    ellipsoids = _Ellipsoids.of(step, s, j, reach)
     for time in _TIMES:
         for n in normals:
-            yield Side(j, n, time, ellipsoid.pushed(path + time * v, n))
+            path = elsewhere.copy()
+            path[reach] = ellipsoids.pushed(free[reach] + time * v, n)
+            yield Side(j, n, time, path)
+
+
+def _first_run(conflict: BoolArray) -> IntArray:
+    """Stages of the first conflict; gaps shorter than its surroundings do not end it."""
+    stages = np.flatnonzero(conflict)
+    gaps = np.flatnonzero(np.diff(stages) > _AROUND)
+    return stages[: gaps[0] + 1] if len(gaps) else stages
 
 
 def _directions(relative: FloatArray, stages: IntArray) -> tuple[FloatArray, list[FloatArray]]:
@@ -110,16 +143,16 @@ def _directions(relative: FloatArray, stages: IntArray) -> tuple[FloatArray, lis
 
 @dataclass(frozen=True, eq=False)
 class _Ellipsoids:
-    """One obstacle's ellipsoids at stages 1 .. N, their axes lengthened by the radii."""
+    """One obstacle's ellipsoids at some stages, their axes lengthened by the radii."""
 
     means: FloatArray
     scaling: FloatArray  # (N, d, d) takes offsets to units of the semi-axes
 
     @classmethod
-    def of(cls, step: StepData, s: float, j: int) -> "_Ellipsoids":
-        variances, rotations = np.linalg.eigh(step.covariances[j, 1:])
+    def of(cls, step: StepData, s: float, j: int, reach: slice) -> "_Ellipsoids":
+        variances, rotations = np.linalg.eigh(step.covariances[j, 1:][reach])
         e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + step.radii[j], 1e-9)
-        return cls(step.means[j, 1:], np.swapaxes(rotations, 1, 2) / e[..., None])
+        return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
 
     def pushed(self, path: FloatArray, n: FloatArray) -> FloatArray:
         """Move the points of a path (N, d) that lie within along n to the boundary."""
