@@ -31,6 +31,7 @@ from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the program
+_STRIDE = 4.0  # where convex steps lead away, how far ahead of them to look, and again
 _NEGLIGIBLE = 1e-6  # [cost / m or unit of input] forces of the guess that are not active
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 _SURPLUS = 0.01  # of the tolerance: worth one more iteration, whose convergence is quadratic
@@ -184,7 +185,7 @@ class CondensedSCP:
     ) -> tuple[Point, IntArray, float, int] | None:
         """Repeat convex step, summed step and certificate about some pairs."""
         tangent, cap, before, point = conflicts.tangent(y), np.inf, np.inf, None
-        bold = True
+        bold, leap = True, 0  # whether to sum; leaps taken in a row
         for iteration in range(1, limit + 1):
             with self.watch.solving:
                 program = self._convex(conflicts, tangent)
@@ -196,21 +197,29 @@ class CondensedSCP:
                 held = self._solve(program, active, cap)
             if held is None:
                 return None
-            active = held.active
-            ahead = self._summed(conflicts, tangent, program, held) if bold else None
-            point = self._certified(conflicts, ahead or held)
-            residual = point.residuals.worst
+            ahead = self._summed(conflicts, tangent, program, held, leap) if bold else None
+            end = self._certified(conflicts, ahead if isinstance(ahead, Held) else held)
+            if leap and point is not None and self._merit(end) > self._merit(point):
+                tangent, leap, bold = point.pushed.tangent, 0, False  # back to before the leap
+                continue
+            point, active, residual = end, held.active, end.residuals.worst
             certified = residual <= self._tolerance
             if residual <= _SURPLUS * self._tolerance or (certified and before <= self._tolerance):
                 break
             if goal is not None and (
-                hopeless(iteration, point.cost, goal)
-                or self._arrives(point, goal)
+                hopeless(iteration, point.cost, goal) or self._arrives(point, goal)
             ):
                 return None
-            bold = ahead is None or residual < before / 2
+            bold = not isinstance(ahead, Held) or residual < before / 2
             before, tangent = residual, point.pushed.tangent
+            leap = leap + 1 if isinstance(ahead, np.ndarray) else 0
+            if isinstance(ahead, np.ndarray):
+                tangent = conflicts.tangent(ahead)
         return None if point is None else (point, active, cap, iteration)
+
+    def _merit(self, point: Point) -> float:
+        slack = 0.0 if point.pushed is None else float(point.pushed.slack.sum())
+        return point.cost + self._problem.slack_weight * slack
 
     def _convex(self, conflicts: Conflicts, tangent: Tangent) -> CondensedProgram:
         """The convex subproblem about a tangent."""
@@ -229,9 +238,16 @@ class CondensedSCP:
         return held
 
     def _summed(
-        self, conflicts: Conflicts, tangent: Tangent, program: CondensedProgram, held: Held
-    ) -> Held | None:
-        """The sum of the convex steps to come, if there is one within the same constraints."""
+        self,
+        conflicts: Conflicts,
+        tangent: Tangent,
+        program: CondensedProgram,
+        held: Held,
+        leap: int,
+    ) -> Held | FloatArray | None:
+        """The sum of the convex steps to come; or if it breaks constraints, or the steps lead away,
+        only where to linearise next.
+        """
         bounds = len(held.force) - len(tangent.g)
         pairs = np.flatnonzero(held.force[bounds:] > _NEGLIGIBLE)
         if not len(pairs):
@@ -242,9 +258,12 @@ class CondensedSCP:
         moved = self._free + self._condensed.response @ held.v - tangent.y
         turned = np.einsum("kwm,kw->km", L, moved[conflicts.at[pairs]])
         bold = summed(held, bends.reshape(-1, bends.shape[-1]), turned.ravel())
-        if bold is None or not self._qp.consistent(program, bold, _ROUNDING):
-            return None
-        return bold
+        if bold is not None and self._qp.consistent(program, bold, _ROUNDING):
+            return bold
+        y = tangent.y + moved + _STRIDE ** (leap + 1) * moved
+        if bold is not None:
+            y = self._free + self._condensed.response @ bold.v
+        return np.clip(y, self._condensed.lower, self._condensed.upper)
 
     def _arrives(self, point: Point, goal: Descent) -> bool:
         """Whether a point is about to end where the goal is: at its cost, and the same way."""

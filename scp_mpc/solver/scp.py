@@ -180,7 +180,7 @@ class SCP:
             total=watch.elapsed,
         )
         qps = self._engine.finished
-        if self._engine is not self._sparse and self._sparse.finished:
+        if self._engine is not self._sparse and self._sparse.watch is watch:
             qps = qps + self._sparse.finished
         return Plan(
             X=iterate.states,

@@ -3,9 +3,8 @@
 One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
 of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
 late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that ignores the
-obstacles; but during one conflict it is put off or brought forward by one stage of the relative
-motion and pushed out of the no-go set square to that motion, and during the other conflicts it is
-the present plan. For an obstacle that crosses, the two sides are before it and behind it.
+obstacles; but during one conflict it is put off or brought forward by a stage or two of the relative
+motion and pushed out of the no-go set, and during the other conflicts it is the present plan. For an obstacle that crosses, the two sides are before it and behind it.
 Linearising about the path gives half-spaces on that side, sound as any.
 
 Notation:
@@ -25,10 +24,9 @@ import numpy as np
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.solver.step_data import StepData
 
-MAX_CANDIDATES = 12  # in one control step, whatever the number of obstacles
+MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
 _AROUND = 3  # stages before and after a conflict that a candidate may change
 _COSINE = 0.9  # of the angle between two directions that count as one side
-_TIMES = (0.0, -1.0, 1.0)  # tau: as the free plan would, one stage later, one earlier
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +115,10 @@ def _ways(
     v, normals = _directions(free - step.means[j, 1:], stages)
     reach = slice(max(stages[0] - _AROUND, 0), stages[-1] + _AROUND + 1)
     ellipsoids = _Ellipsoids.of(step, s, j, reach)
-    for time in _TIMES:
+    for time, push in _WAYS:
         for n in normals:
             path = elsewhere.copy()
-            path[reach] = ellipsoids.pushed(free[reach] + time * v, n)
+            path[reach] = push(ellipsoids, free[reach] + time * v, n)
             yield Side(j, n, time, path)
 
 
@@ -154,11 +152,30 @@ class _Ellipsoids:
         e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + step.radii[j], 1e-9)
         return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
 
-    def pushed(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move the points of a path (N, d) that lie within along n to the boundary."""
+    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move the points of a path (k, d) that lie within along n to the boundary."""
         w = (self.scaling @ (path - self.means)[..., None])[..., 0]
         m = self.scaling @ n
         mm, wm = (m * m).sum(axis=1), (w * m).sum(axis=1)
         room = 1 - (w * w).sum(axis=1)  # positive inside
         shift = np.where(room > 0, (np.sqrt(wm**2 + mm * np.maximum(room, 0.0)) - wm) / mm, 0.0)
         return path + shift[:, None] * n
+
+    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move them away from the centre, and half as much towards n, to the boundary."""
+        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
+        m = self.scaling @ n
+        within = (w * w).sum(axis=1) < 1
+        w[within] += 0.5 * m[within] / np.linalg.norm(m[within], axis=1, keepdims=True)
+        w[within] /= np.maximum(np.linalg.norm(w[within], axis=1, keepdims=True), 1e-12)
+        boundary: FloatArray = self.means + np.linalg.solve(self.scaling, w[..., None])[..., 0]
+        return boundary
+
+
+# tau, and how to leave the no-go set: as the free plan would, one stage later or earlier, two later
+_WAYS = (
+    (0.0, _Ellipsoids.aside),
+    (-1.0, _Ellipsoids.aside),
+    (1.0, _Ellipsoids.aside),
+    (-2.0, _Ellipsoids.outward),
+)

@@ -47,6 +47,7 @@ class SparseSCP:
         self._subproblem = Subproblem(problem)
         self._qp = TrustedSolver(self._subproblem.program, settings.qp)
         self._stale = False
+        self.watch: Stopwatch | None = None
 
     @property
     def finished(self) -> Counter[str]:
