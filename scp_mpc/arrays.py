@@ -121,7 +121,7 @@ def require_positive_semidefinite(argument: str, matrices: FloatArray) -> FloatA
     if (asymmetry > allowed).any():
         at = int(np.argmax(asymmetry > allowed))
         raise CovarianceError(argument, f"matrix {at} is not symmetric (by {asymmetry[at]:.3g})")
-    eigenvalues: FloatArray = np.linalg.eigvalsh(matrices)
+    eigenvalues = np.linalg.eigvalsh(matrices).astype(np.float64)
     smallest = eigenvalues[..., 0]
     if (smallest < -allowed).any():
         at = int(np.argmax(smallest < -allowed))

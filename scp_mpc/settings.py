@@ -49,7 +49,8 @@ class Settings:
             an extrapolation did not help.
         condense: Eliminate the dynamics and solve small dense programs with an active-set method;
             else, and where that has no answer, sparse programs go to OSQP first.
-        acceleration: On the sparse programs, extrapolate the linearisation point; see `scp_mpc.solver.acceleration`.
+        acceleration: On the sparse programs, extrapolate the linearisation point; see
+            `scp_mpc.solver.acceleration`.
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
         rivals: How many of the ways past it to follow to the end; all are ranked.

@@ -145,7 +145,7 @@ def test_what_cannot_be_avoided_is_softened_and_said_so():
     assert not plan.ok
     assert plan.slack.max() > 0.1
     # The slack is the true violation, stage by stage.
-    value = StepData.read(case, x0, ref, obstacles).half_spaces(case, plan.X, plan.iterate.s).value
+    value = StepData.read(case, x0, ref, obstacles).half_spaces(plan.X, plan.iterate.s).value
     np.testing.assert_allclose(np.maximum(0.0, -value), plan.slack, atol=1e-6)
     assert plan.kkt.worst <= 1e-6
     assert (np.abs(plan.multipliers.obstacles) <= case.slack_weight * (1 + 1e-9)).all()
@@ -178,7 +178,7 @@ def test_without_any_solution_the_guess_is_kept_within_limits():
     np.testing.assert_array_equal(plan.X[0], case.x0)
     assert plan.kkt == KKTResiduals(np.inf, np.inf, np.inf)
     step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
-    value = step.half_spaces(case.problem, plan.X, np.array([S_REF])).value
+    value = step.half_spaces(plan.X, np.array([S_REF])).value
     assert value.min() < -0.01
     np.testing.assert_allclose(plan.slack, np.maximum(0.0, -value), atol=1e-12)
     assert plan.multipliers is None

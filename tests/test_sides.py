@@ -16,7 +16,7 @@ def starts(case, reference, obstacles):
     step = StepData.read(case, reference[0], reference, obstacles)
     M = case.max_obstacles
     free = Iterate(reference, np.zeros((N, case.model.nu)), np.full(M, S_REF), np.zeros((M, N)))
-    value = step.half_spaces(case, free.states, free.s).value
+    value = step.half_spaces(free.states, free.s).value
     position = case.model.position
     return step, value, candidates(free, position, step.sets, value)
 
@@ -31,7 +31,7 @@ def test_planar_candidates_pass_left_and_right():
     for start in (left, right):
         moved = (start.states != ref).any(axis=1)[1:]
         np.testing.assert_array_equal(moved, inside)
-        spaces = step.half_spaces(case, start.states, start.s)
+        spaces = step.half_spaces(start.states, start.s)
         np.testing.assert_allclose(spaces.value[0, inside], 0.0, atol=1e-9)
         normal = spaces.normal[0, inside]
         np.testing.assert_allclose(normal[:, 0], 0.0, atol=1e-7)  # square to the motion
@@ -64,7 +64,7 @@ def test_in_space_there_are_four_sides():
     step, value, found = starts(case, ref, [ball])
     assert len(found) == 4
     normals = [
-        step.half_spaces(case, start.states, start.s).normal[0, value[0] < 0].mean(axis=0)
+        step.half_spaces(start.states, start.s).normal[0, value[0] < 0].mean(axis=0)
         for start in found
     ]
     np.testing.assert_allclose(np.sum(normals, axis=0), 0.0, atol=1e-6)
@@ -97,5 +97,5 @@ def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
     np.testing.assert_allclose(step.start, [[-0.1, 0.4]])
     on_top = ref.copy()
     on_top[1:, [0, 2]] = centre.means[1:]
-    normal = step.half_spaces(case, on_top, np.array([S_REF])).normal[0, 0]
+    normal = step.half_spaces(on_top, np.array([S_REF])).normal[0, 0]
     assert normal @ step.start[0] > 0

@@ -82,7 +82,7 @@ def random_program(dim=2, soft=False, seed=0):
     nx = this.model.nx
     obstacles = case.obstacles if dim == 2 else []
     step = StepData.read(this, rng.normal(size=nx), rng.normal(size=(9, nx)), obstacles)
-    spaces = step.half_spaces(this, rng.normal(size=(9, nx)), rng.uniform(1, 3, 2))
+    spaces = step.half_spaces(rng.normal(size=(9, nx)), rng.uniform(1, 3, 2))
     subproblem = Subproblem(this)
     subproblem.soft = soft
     subproblem.write_step(step.x0, step.x_ref)

@@ -45,16 +45,13 @@ class Inflation(ABC):
         """
 
     @abstractmethod
-    def bend(
-        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
-    ) -> FloatArray:
+    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """Factor L (M, N, d+1, d-1) of g's second derivative in (p, s): Hessian = L L'.
 
         Args:
             sets: The obstacles' ellipsoids.
-            positions: Where g was linearised; as for `linearise`.
-            s: (M,) sizes there.
-            spaces: What `linearise` made of it.
+            s: (M,) sizes where g was linearised.
+            spaces: What `linearise` made of it there.
         """
 
     @abstractmethod
@@ -92,9 +89,7 @@ class ExactInflation(Inflation):
         offset = np.add.reduce(normal * sets.means, axis=-1) + radii
         return _masked(sets, normal, slope, offset, sd - radii)
 
-    def bend(
-        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
-    ) -> FloatArray:
+    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class.
 
         From y = grad h(n) + sd n with the support function h(n) = s |diag(sigma) n|: on the tangent
@@ -152,17 +147,16 @@ class AxesInflation(Inflation):
         offset = np.add.reduce(normal * positions, axis=-1) + slope * s[:, None] - value
         return _masked(sets, normal, slope, offset, value)
 
-    def bend(
-        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, spaces: HalfSpaces
-    ) -> FloatArray:
+    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class; the change of w with s alone is left out: g is not convex in it."""
-        y = sets.to_eigenframe(positions - sets.means)
         e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
-        w = y / e
-        norm = np.maximum(np.sqrt(np.square(w).sum(axis=-1, keepdims=True)), 1e-12)
-        T = tangents(w / norm) * np.sqrt(self._scale(sets)[..., None] / norm)[..., None]
+        scale = self._scale(sets)[..., None]
+        norm = np.maximum(spaces.value[..., None] / scale + 1, 1e-12)
+        direction = e * sets.to_eigenframe(spaces.normal)
+        direction /= np.sqrt(np.add.reduce(direction * direction, axis=-1, keepdims=True))
+        T = tangents(direction) * np.sqrt(scale / norm)[..., None]
         L = T / e[..., None]
-        across = -(w * sets.deviations)[..., None, :] @ L
+        across = -(norm * direction * sets.deviations)[..., None, :] @ L
         return np.concatenate([sets.rotations @ L, across], axis=-2)
 
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:

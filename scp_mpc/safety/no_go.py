@@ -50,9 +50,7 @@ class NoGoSets:
         return cls._stacked(predictions, slice(0, 1), robot_radius, len(predictions), 1, dim)
 
     @classmethod
-    def pairs(
-        cls, means: FloatArray, covariances: FloatArray, radii: FloatArray
-    ) -> "NoGoSets":
+    def pairs(cls, means: FloatArray, covariances: FloatArray, radii: FloatArray) -> "NoGoSets":
         """Single stages, each in a slot of its own: means (K, d), covariances (K, d, d).
 
         Args:

@@ -130,7 +130,7 @@ class ActiveSetSolver:
     def _search(
         self, program: CondensedProgram, active: IntArray, cap: float
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that turn out to matter."""
+        """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that matter."""
         nf, K = len(self._F), len(program.b)
         lower, upper = program.lower, program.upper
         within = (active[:nf] != 0) | (lower > 0) | (upper < 0)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scp_mpc.arrays import BoolArray, FloatArray
+from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.conflicts import Conflicts, Tangent
@@ -63,6 +63,12 @@ class Point:
     pushed: Pushed | None
     cost: float
     residuals: KKTResiduals
+
+    @property
+    def tangent(self) -> Tangent:
+        """The obstacles' constraints about this point, where some are near."""
+        assert self.pushed is not None
+        return self.pushed.tangent
 
     @property
     def slack(self) -> float:

@@ -18,6 +18,8 @@ Notation:
     2 Q e + D' nu = phi_e,   2 R u - B' nu = phi_u      (forces phi of the constraints on e and u)
 """
 
+from typing import Any
+
 import numpy as np
 from scipy import sparse
 from scipy.linalg import solve_triangular
@@ -57,7 +59,8 @@ class Condensed:
         # A size that cannot shrink never moves: larger ones only cost more and leave less room.
         self.moving_sizes = M if margin.lower < margin.reference else 0
         self.boxed = slice(self.u.start, self.u.stop + self.moving_sizes)
-        D = sparse.eye(N * model.nx) - sparse.kron(sparse.eye(N, k=-1), model.A)
+        steps = sparse.kron(sparse.eye(N, k=-1), model.A)
+        D = sparse.csc_matrix(sparse.eye(N * model.nx) - steps)
         self._dynamics = splu(  # its own factor: no fill, no pivoting
             sparse.csc_matrix(D), permc_spec="NATURAL", diag_pivot_thresh=0.0
         )
@@ -91,15 +94,17 @@ class Condensed:
 
     def costates(self, forces: FloatArray) -> FloatArray:
         """Solve D' nu = forces (N, nx) for nu (N, nx): backwards in time."""
-        nu: FloatArray = self._dynamics.solve(forces.ravel(), trans="T")
+        backwards: Any = self._dynamics.solve
+        nu: FloatArray = backwards(forces.ravel(), trans="T")
         return nu.reshape(forces.shape)
 
-    def _kkt_matrix(self, D: sparse.spmatrix) -> sparse.csc_matrix:
+    def _kkt_matrix(self, D: sparse.csc_matrix) -> sparse.csc_matrix:
         problem, N = self._problem, self._problem.horizon
-        Q = sparse.block_diag([2 * problem.Q] * (N - 1) + [2 * problem.Qf])
+        Q = sparse.csc_matrix(sparse.block_diag([2 * problem.Q] * (N - 1) + [2 * problem.Qf]))
         R = sparse.kron(sparse.eye(N), 2 * problem.R)
         B = sparse.kron(sparse.eye(N), problem.model.B)
-        return sparse.csc_matrix(sparse.bmat([[Q, None, D.T], [None, R, -B.T], [D, -B, None]]))
+        blocks: Any = [[Q, None, D.T], [None, R, -B.T], [D, -B, None]]
+        return sparse.csc_matrix(sparse.bmat(blocks))
 
     def _outputs(self) -> IntArray:
         """Places of positions and inputs within the KKT system's unknowns."""

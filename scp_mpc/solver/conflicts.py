@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.arrays import BoolArray, FloatArray
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.solver.condensed import Condensed
@@ -60,9 +60,7 @@ class Conflicts:
         self.at[:, d] = condensed.s.start + j
         self.response = condensed.response[self.at]
         self._step, self._p = step, condensed.p
-        self._sets = NoGoSets.pairs(
-            step.means[j, i + 1], step.covariances[j, i + 1], step.radii[j]
-        )
+        self._sets = NoGoSets.pairs(step.means[j, i + 1], step.covariances[j, i + 1], step.radii[j])
         self._means_before = step.means[j, i]
         position = step.problem.model.position
         self._reference = step.x_ref[1:, position]
@@ -109,10 +107,10 @@ class Conflicts:
         """Factor L (K, w, d-1) of the second derivatives at the tangent's point."""
         s = tangent.y[self.at[:, -1]]
         no_go = self._step.problem.no_go
-        return no_go.bend(self._sets, tangent.positions, s, tangent.spaces)[:, 0]
+        return no_go.bend(self._sets, s, tangent.spaces)[:, 0]
 
-    def table(self, values: FloatArray, fill: float, slots: int, stages: int) -> FloatArray:
-        """Return one value per pair as (M, N), with `fill` elsewhere."""
-        table = np.full((slots, stages), fill)
-        table[self.obstacle, self.stage] = values
+    def table(self, marked: BoolArray, slots: int, stages: int) -> BoolArray:
+        """Return which pairs are marked (K,) as (slots, stages)."""
+        table = np.zeros((slots, stages), dtype=np.bool_)
+        table[self.obstacle, self.stage] = marked
         return table

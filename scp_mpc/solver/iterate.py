@@ -12,7 +12,7 @@ import numpy as np
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.robots.linear import LinearModel
 
-_NEGLIGIBLE = 1e-6  # [cost / m]; an interior-point solver leaves no multiplier exactly zero
+NEGLIGIBLE = 1e-6  # [cost / m, or per unit of input]; interior points leave none exactly zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +57,7 @@ class Iterate:
     @property
     def touches(self) -> bool:
         """Whether an obstacle may shape this point: an active constraint, or no multipliers."""
-        duals = self.multipliers
-        return duals is None or bool((duals.obstacles < -_NEGLIGIBLE).any())
+        return self.multipliers is None or bool(self.touched.any())
 
     @property
     def touched(self) -> BoolArray:
@@ -66,7 +65,8 @@ class Iterate:
         duals = self.multipliers
         if duals is None:
             return np.zeros(self.slack.shape, dtype=np.bool_)
-        return duals.obstacles < -_NEGLIGIBLE
+        touched: BoolArray = duals.obstacles < -NEGLIGIBLE
+        return touched
 
     def frozen(self) -> "Iterate":
         """Mark the primal arrays read-only: a plan shares them with the next step's guess."""

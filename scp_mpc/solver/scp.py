@@ -53,8 +53,10 @@ class SCP:
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
         self._busy = Lock()
         self._sparse = SparseSCP(problem, self.settings)
-        condensed = CondensedSCP.of(problem, self.settings) if self.settings.condense else None
-        self._engine: CondensedSCP | SparseSCP = condensed or self._sparse
+        self._condensed = (
+            CondensedSCP.of(problem, self.settings) if self.settings.condense else None
+        )
+        self._engine: CondensedSCP | SparseSCP = self._condensed or self._sparse
 
     def solve(
         self,
@@ -120,19 +122,21 @@ class SCP:
         best = self._engine.unhindered()
         if best is None:
             start = self._engine.free() if nominal is None else nominal()
-            best = self._descend(start)
+            best = self._descend(step, watch, start)
             wanted = not best.status.ok or (challenge and best.iterate.touches)
             if self.settings.sides and wanted:
                 best, tried, switched = self._challenge(step, best)
         return self._plan(step, best, tried, switched, watch)
 
-    def _descend(self, nominal: Iterate) -> Descent:
+    def _descend(self, step: StepData, watch: Stopwatch, nominal: Iterate) -> Descent:
         """Descend on the condensed problem; on the sparse one where that has no answer."""
         limit = self.settings.max_iterations
-        best = self._engine.descend(nominal, limit)
-        if best is not None and (best.status.certified or self._engine is self._sparse):
+        if self._condensed is None:
+            return self._sparse.descend(nominal, limit)
+        best = self._condensed.descend(nominal, limit)
+        if best is not None and best.status.certified:
             return best
-        self._sparse.begin(self._engine.step, self._engine.watch)
+        self._sparse.begin(step, watch)
         other = self._sparse.descend(nominal, limit)
         return other if best is None or other.beats(best, lead=0.0) else best
 
@@ -142,9 +146,7 @@ class SCP:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
         free = self._engine.free()
         here = self._passing(best.iterate, best.iterate.touched[: step.count])
-        sides = candidates(
-            step, free.states[1:, self.problem.model.position], here.path, free.s
-        )
+        sides = candidates(step, free.states[1:, self.problem.model.position], here.path, free.s)
         present = replace(best.iterate, s=free.s)
         starts = self._engine.glimpses(present, [side.path for side in sides])
         tried = tuple(
@@ -180,7 +182,7 @@ class SCP:
             total=watch.elapsed,
         )
         qps = self._engine.finished
-        if self._engine is not self._sparse and self._sparse.watch is watch:
+        if self._condensed is not None and self._sparse.watch is watch:
             qps = qps + self._sparse.finished
         return Plan(
             X=iterate.states,

@@ -2,10 +2,11 @@
 
 One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
 of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
-late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that ignores the
-obstacles; but during one conflict it is put off or brought forward by a stage or two of the relative
-motion and pushed out of the no-go set, and during the other conflicts it is the present plan. For an obstacle that crosses, the two sides are before it and behind it.
-Linearising about the path gives half-spaces on that side, sound as any.
+late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that
+ignores the obstacles; but during one conflict it is put off or brought forward by a stage or two of
+the relative motion and pushed out of the no-go set, and during the other conflicts it is the
+present plan. For an obstacle that crosses, the two sides are before it and behind it. Linearising
+about the path gives half-spaces on that side, sound as any.
 
 Notation:
     p       (N, d)      positions of the plan that ignores the obstacles
@@ -59,9 +60,7 @@ class Passing:
     touched: BoolArray
 
 
-def candidates(
-    step: StepData, free: FloatArray, present: FloatArray, s: FloatArray
-) -> list[Side]:
+def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatArray) -> list[Side]:
     """Return the ways past the obstacles in conflict, the first conflict first; none without any.
 
     Args:
@@ -77,7 +76,9 @@ def candidates(
     ways = (
         side
         for j in order
-        for side in _ways(step, free, _elsewhere(free, present, conflict, j), float(s[j]), j, conflict[j])
+        for side in _ways(
+            step, free, _elsewhere(free, present, conflict, j), float(s[j]), j, conflict[j]
+        )
     )
     return list(islice(ways, MAX_CANDIDATES))
 

@@ -47,7 +47,7 @@ class SparseSCP:
         self._subproblem = Subproblem(problem)
         self._qp = TrustedSolver(self._subproblem.program, settings.qp)
         self._stale = False
-        self.watch: Stopwatch | None = None
+        self.watch = Stopwatch()
 
     @property
     def finished(self) -> Counter[str]:
@@ -80,25 +80,22 @@ class SparseSCP:
         nominal = self._subproblem.resting(self.step.x_ref)
         return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
 
-    def glimpses(self, free: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
+    def glimpses(self, best: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
         """Solve one program about each path (N, d)."""
-        ends = [self.descend(moved(free, self._problem.model.position, path), 1) for path in paths]
-        return [
-            Glimpse(
-                end.merit if end.status.ok else np.inf,
-                end.iterate.touched[: self.step.count],
-                lambda end=end: end.iterate,
-            )
-            for end in ends
-        ]
+        position = self._problem.model.position
+        return [self._glimpse(self.descend(moved(best, position, path), 1)) for path in paths]
 
-    def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
+    def _glimpse(self, end: Descent) -> Glimpse:
+        merit = end.merit if end.status.ok else np.inf
+        return Glimpse(merit, end.iterate.touched[: self.step.count], end.make)
+
+    def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent:
         """Run the loop from one nominal plan, for at most `limit` subproblems.
 
         Args:
             nominal: Where to begin.
             limit: Subproblems at most.
-            goal: Give up, with None, when it is plain that this plan will not be reached.
+            goal: Stop when it is plain that this plan will not be reached.
         """
         tolerance = self._settings.tolerance
         self._subproblem.soft = False
@@ -110,11 +107,11 @@ class SparseSCP:
             if convex is None:
                 break
             iterate, iterations = convex, iterations + 1
-            if goal is not None and hopeless(iterations, self._merit(iterate), goal):
-                return None
             if self._settings.acceleration:
                 acceleration.learn(iterate)
             residuals = self._linearise_about(iterate)
+            if goal is not None and hopeless(iterations, self._merit(iterate), goal):
+                break
         if iterations == 0 and residuals.worst > tolerance:
             return self._given_up(nominal)
         status = judge(residuals, iterate.slack.max(initial=0.0), tolerance)
@@ -185,4 +182,3 @@ class SparseSCP:
 
     def _cost(self, iterate: Iterate) -> float:
         return self._problem.cost(iterate.states, iterate.inputs, iterate.s, self.step.x_ref)
-

@@ -143,7 +143,9 @@ class StepData:
         if not unclear.any():
             return None
         y = y[unclear]
-        width2 = np.add.reduce((self.covariances[:, 1:][unclear] @ y[..., None])[..., 0] * y, axis=1)
+        width2 = np.add.reduce(
+            (self.covariances[:, 1:][unclear] @ y[..., None])[..., 0] * y, axis=1
+        )
         size, reach = (np.broadcast_to(v, unclear.shape)[unclear] for v in (size, reach))
         length2 = length2[unclear]
         close = length2 - size * np.sqrt(np.maximum(width2, 0.0)) <= reach * np.sqrt(length2)

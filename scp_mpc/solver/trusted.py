@@ -9,8 +9,8 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.settings import QPSettings
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
 from scp_mpc.solver.qp import OSQPSolver, QPSolution
-from scp_mpc.solver.stopwatch import Lap
 from scp_mpc.solver.rescue import RescueSolver
+from scp_mpc.solver.stopwatch import Lap
 
 _USABLE = 1e-3  # KKT residual beyond which a point is no solution
 
@@ -33,7 +33,9 @@ class TrustedSolver:
         self._rescue = None if not settings.rescue else RescueSolver(program)
         self.finished: Counter[str] = Counter()
 
-    def solve(self, x: FloatArray, y: FloatArray, residual: float = 0.0, lap: Lap | None = None) -> QPSolution | None:
+    def solve(
+        self, x: FloatArray, y: FloatArray, residual: float = 0.0, lap: Lap | None = None
+    ) -> QPSolution | None:
         """Solve the program as it stands, warm-started at x and y; None if nobody could.
 
         Args:
