@@ -63,7 +63,9 @@ def test_accelerated_and_plain_reach_the_same_optimum_the_former_sooner(inflatio
             guess = Trajectory(case.x_ref, np.zeros((20, 2)))
             plans = {}
             for bold in (True, False):
-                settings = Settings(sides=False, max_iterations=300, acceleration=bold)
+                settings = Settings(
+                    sides=False, condense=False, max_iterations=300, acceleration=bold
+                )
                 solver = SCP(case.problem, settings)
                 plans[bold] = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
                 assert plans[bold].status is Status.CONVERGED

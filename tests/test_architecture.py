@@ -21,7 +21,12 @@ FLOORS = [
     {"cli", "__init__"},
 ]
 FILES = sorted(PACKAGE.rglob("*.py"))
-ONLY_IN = {"osqp": "solver/qp.py", "piqp": "solver/rescue.py", "qpsolvers": "solver/oracle.py", "daqp": "solver/active_set.py"}
+ONLY_IN = {
+    "osqp": "solver/qp.py",
+    "piqp": "solver/rescue.py",
+    "qpsolvers": "solver/oracle.py",
+    "daqp": "solver/active_set.py",
+}
 
 
 def name(path: Path) -> str:

@@ -75,7 +75,7 @@ def test_the_side_decides_where_the_nearest_point_is_not_unique():
     e = np.array([[2.0, 1.0], [2.0, 1.0], [1.0, 1.0]])
     y = np.array([[0.3, 0.0], [0.3, 0.0], [0.0, 0.0]])
     side = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
-    sd, n = signed_distance(y, e, side)
+    sd, n = signed_distance(y, e, lambda: side)
     assert np.isfinite(sd).all()
     assert n[0, 1] > 0.9
     assert n[1, 1] < -0.9

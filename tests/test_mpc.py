@@ -207,7 +207,7 @@ def test_sides_are_tried_at_first_contact_and_then_at_intervals():
                 blocking = [obstacle(20, (4.0 + 0.06 * k, 0.0), (0.3, 0.0), 0.3 * np.eye(2))]
                 plan = mpc.step(x, ref, blocking)
                 assert plan.iterate.touches
-                tried.append(plan.candidates > 0)
+                tried.append(len(plan.candidates) > 0)
                 x = case.model.step(x, plan.u0)
             mpc.reset()
         pattern = [k % interval == 0 for k in range(7)]

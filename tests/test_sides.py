@@ -1,59 +1,96 @@
-"""Candidates on other sides: on the boundary, on both sides, only where there is a conflict."""
+"""Ways past an obstacle: out of the no-go set, on both sides, only where there is a conflict."""
 
 import numpy as np
 import pytest
 from instances import S_REF, obstacle, problem, rotated, straight_reference
 
-from scp_mpc import DoubleIntegrator, Iterate, ObstaclePrediction
-from scp_mpc.solver.sides import candidates
+from scp_mpc import DoubleIntegrator, ObstaclePrediction
+from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
 from scp_mpc.solver.step_data import StepData
 
 N = 20
+S = np.array([S_REF])
 
 
-def starts(case, reference, obstacles):
-    """Candidates about a plan that follows the reference."""
+def ways(case, reference, obstacles, present=None):
+    """Ways past, about a plan that follows the reference."""
     step = StepData.read(case, reference[0], reference, obstacles)
-    M = case.max_obstacles
-    free = Iterate(reference, np.zeros((N, case.model.nu)), np.full(M, S_REF), np.zeros((M, N)))
-    value = step.half_spaces(free.states, free.s).value
-    position = case.model.position
-    return step, value, candidates(free, position, step.sets, value)
+    free = reference[1:, case.model.position]
+    s = np.full(case.max_obstacles, S_REF)
+    return step, candidates(step, free, free if present is None else present, s)
 
 
-def test_planar_candidates_pass_left_and_right():
-    case, ref = problem(N, "exact"), straight_reference(N)
+def test_the_free_plans_own_time_passes_left_and_right():
+    """At tau = 0 every point of the conflict moves square to the motion, out of the axes' set."""
+    case, ref = problem(N, "axes"), straight_reference(N)
     blocking = obstacle(N, (3.0, 0.1), (0.5, 0.0), rotated((0.4, 0.1), 0.7))
-    step, value, (left, right) = starts(case, ref, [blocking])
-    inside = value[0] < 0
+    step, found = ways(case, ref, [blocking])
+    free = ref[1:, [0, 2]]
+    inside = step.conflicts(free, S)[0]
     assert 2 < inside.sum() < N
-    sides = []
-    for start in (left, right):
-        moved = (start.states != ref).any(axis=1)[1:]
-        np.testing.assert_array_equal(moved, inside)
-        spaces = step.half_spaces(start.states, start.s)
-        np.testing.assert_allclose(spaces.value[0, inside], 0.0, atol=1e-9)
-        normal = spaces.normal[0, inside]
-        np.testing.assert_allclose(normal[:, 0], 0.0, atol=1e-7)  # square to the motion
-        sides.append(set(np.sign(normal[:, 1])))
-    assert sides in ([{1.0}, {-1.0}], [{-1.0}, {1.0}])
+    left, right = (side for side in found if side.time == 0)
+    for side in (left, right):
+        shift = side.path - free
+        np.testing.assert_array_equal(shift.any(axis=1), inside)
+        np.testing.assert_allclose(shift[:, 0], 0.0, atol=1e-9)
+        assert (shift[inside] @ side.normal > 0).all()
+        states = ref.copy()
+        states[1:, [0, 2]] = side.path
+        value = step.half_spaces(states, S).value[0]
+        np.testing.assert_allclose(value[inside], 0.0, atol=1e-9)
+    np.testing.assert_allclose(left.normal, -right.normal)
 
 
-def test_the_first_conflict_in_time_decides():
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+def test_no_way_leads_through_the_conflict(inflation):
+    case, ref = problem(N, inflation), straight_reference(N)
+    step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
+    stages = np.flatnonzero(step.conflicts(ref[1:, [0, 2]], S)[0])
+    assert {side.time for side in found} == {0.0, -1.0, 1.0, -2.0}
+    assert len(found) == 8
+    for side in found:
+        offset = side.path[stages] - step.means[0, stages + 1]
+        y = offset / (S_REF * np.sqrt(np.diagonal(step.covariances[0, stages + 1], 0, 1, 2)) + 0.35)
+        assert (np.linalg.norm(y, axis=1) >= 1 - 1e-9).all()
+
+
+def test_the_first_conflict_comes_first_and_others_keep_the_present_plan():
     case, ref = problem(N, "exact", max_obstacles=2), straight_reference(N)
     near, far = obstacle(N, (2.0, 0.0)), obstacle(N, (6.0, 0.0))
-    step, value, found = starts(case, ref, [far, near])
-    for start in found:
-        moved = np.flatnonzero((start.states != ref).any(axis=1)[1:])
-        np.testing.assert_array_equal(moved, np.flatnonzero(value[1] < 0))
-    assert len(found) == 2
-    assert step.count == 2
+    present = ref[1:, [0, 2]] + [0.0, 1.5]
+    step, found = ways(case, ref, [far, near], present)
+    conflict = step.conflicts(ref[1:, [0, 2]], np.full(2, S_REF))
+    assert [side.obstacle for side in found] == [1] * 8 + [0] * 8
+    for side in found[:8]:
+        np.testing.assert_array_equal(side.path[conflict[0]], present[conflict[0]])
+        assert not np.array_equal(side.path[conflict[1]], present[conflict[1]])
+
+
+def test_only_the_first_of_two_conflicts_with_one_obstacle_changes():
+    """An obstacle that comes back: each candidate passes it once, and keeps to the plan later."""
+    case, ref = problem(40, "exact"), straight_reference(40)
+    ahead = ref[:, [0, 2]] + [0.0, 3.0]
+    ahead[5:8] = ahead[30:34] = 0.0
+    ahead[5:8] = ref[5:8][:, [0, 2]]
+    ahead[30:34] = ref[30:34][:, [0, 2]]
+    twice = ObstaclePrediction(ahead, 0.01 * np.eye(2), 0.2)
+    present = ref[1:, [0, 2]] + [0.0, -2.0]
+    _, found = ways(case, ref, [twice], present)
+    assert found
+    for side in found:
+        np.testing.assert_array_equal(side.path[29:33], present[29:33])
 
 
 def test_no_conflict_no_candidates():
     case, ref = problem(N, "exact"), straight_reference(N)
-    assert starts(case, ref, [obstacle(N, (3.0, 5.0))])[2] == []
-    assert starts(case, ref, [])[2] == []
+    assert ways(case, ref, [obstacle(N, (3.0, 5.0))])[1] == []
+    assert ways(case, ref, [])[1] == []
+
+
+def test_many_obstacles_do_not_make_many_candidates():
+    case, ref = problem(N, "exact", max_obstacles=6), straight_reference(N)
+    row = [obstacle(N, (1.0 + j, 0.1)) for j in range(6)]
+    assert len(ways(case, ref, row)[1]) == MAX_CANDIDATES
 
 
 def test_in_space_there_are_four_sides():
@@ -61,31 +98,34 @@ def test_in_space_there_are_four_sides():
     ref = np.zeros((N + 1, 6))
     ref[:, 0], ref[:, 1] = 0.2 * np.arange(N + 1), 2.0
     ball = ObstaclePrediction(np.tile([2.0, 0.02, 0.05], (N + 1, 1)), 0.01 * np.eye(3), 0.2)
-    step, value, found = starts(case, ref, [ball])
-    assert len(found) == 4
-    normals = [
-        step.half_spaces(start.states, start.s).normal[0, value[0] < 0].mean(axis=0)
-        for start in found
-    ]
-    np.testing.assert_allclose(np.sum(normals, axis=0), 0.0, atol=1e-6)
-    np.testing.assert_allclose(np.array(normals)[:, 0], 0.0, atol=1e-6)
+    _, found = ways(case, ref, [ball])
+    normals = np.array([side.normal for side in found if side.time == 0])
+    assert len(normals) == 4
+    np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(normals[:, 0], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("inflation", ["exact", "axes"])
 def test_keeping_pace_with_the_obstacle_still_gives_sides(inflation):
     """No relative motion: the sides are square to the way out."""
     case, ref = problem(N, inflation), straight_reference(N)
-    alongside = obstacle(N, (0.1, 0.3), (2.0, 0.0))
-    _, _, found = starts(case, ref, [alongside])
-    assert len(found) == 2
-    offsets = [(s.states - ref)[1:, [0, 2]] for s in found]
-    assert all(np.isfinite(offset).all() for offset in offsets)
-    moved = offsets[0].any(axis=1)
-    assert moved.any()
-    # Two sides, opposite to each other and square to the offset (-0.1, -0.3) from the obstacle.
-    across = np.array([-0.3, 0.1]) / np.hypot(0.3, 0.1)
-    sides = [np.sign((offset[moved] @ across).mean()) for offset in offsets]
-    assert sorted(sides) == [-1.0, 1.0]
+    step, found = ways(case, ref, [obstacle(N, (0.1, 0.3), (2.0, 0.0))])
+    assert all(np.isfinite(side.path).all() for side in found)
+    offset = ref[1, [0, 2]] - step.means[0, 1]
+    for side in found:
+        assert side.normal @ offset == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_same_way_is_the_same_stages_on_the_same_side():
+    case, ref = problem(N, "exact"), straight_reference(N)
+    step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
+    touched = step.conflicts(ref[1:, [0, 2]], S)
+    left, right = (Passing(side.path, touched) for side in found if side.time == 0)
+    assert same_way(step, left, left)
+    assert not same_way(step, left, right)
+    fewer = touched.copy()
+    fewer[0, np.flatnonzero(touched[0])[0]] = False
+    assert not same_way(step, left, Passing(left.path, fewer))
 
 
 def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():

@@ -69,8 +69,9 @@ class Iterate:
         return touched
 
     def frozen(self) -> "Iterate":
-        """Mark the primal arrays read-only: a plan shares them with the next step's guess."""
-        for array in (self.states, self.inputs, self.s, self.slack):
+        """Mark the arrays read-only: a plan shares them with the next step's guess."""
+        duals = () if self.multipliers is None else vars(self.multipliers).values()
+        for array in (self.states, self.inputs, self.s, self.slack, *duals):
             array.setflags(write=False)
         return self
 

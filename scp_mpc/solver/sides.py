@@ -27,6 +27,7 @@ from scp_mpc.solver.step_data import StepData
 
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
 _AROUND = 3  # stages before and after a conflict that a candidate may change
+_STILL = 1e-6  # relative motion in one stage, over the distance, that counts as none
 _COSINE = 0.9  # of the angle between two directions that count as one side
 
 
@@ -133,7 +134,7 @@ def _first_run(conflict: BoolArray) -> IntArray:
 def _directions(relative: FloatArray, stages: IntArray) -> tuple[FloatArray, list[FloatArray]]:
     begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(relative) - 1)
     v = (relative[end] - relative[begin]) / max(end - begin, 1)
-    if not v.any():
+    if np.linalg.norm(v) <= _STILL * np.linalg.norm(relative[begin]):
         v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
     square = np.linalg.svd(v[None])[2][1:]

@@ -1,0 +1,99 @@
+"""The condensed problem: the sparse one with its dynamics eliminated, and nothing else."""
+
+import numpy as np
+import pytest
+from instances import KINDS, S_REF, instance, obstacle, problem, straight_reference
+
+from scp_mpc import SCP, DoubleIntegrator, LinearModel, QPSettings, Settings, Status, Trajectory
+from scp_mpc.solver.condensed import Condensed
+from scp_mpc.trajectory import rollout
+
+SPARSE = Settings(sides=False, condense=False, qp=QPSettings(accuracy=1e-9), max_iterations=300)
+
+
+def spaces():
+    """A planar and a spatial problem; the latter with full weights and sizes that move."""
+    rng = np.random.default_rng(0)
+    G = rng.normal(size=(6, 6))
+    return [
+        problem(7),
+        problem(
+            6,
+            "exact",
+            0.5,
+            2,
+            model=DoubleIntegrator(0.1, dim=3),
+            Q=G @ G.T,
+            Qf=np.diag(rng.uniform(1, 2, 6)),
+            R=[0.1, 0.2, 0.3],
+        ),
+    ]
+
+
+@pytest.mark.parametrize("case", spaces(), ids=["plane", "space"])
+def test_every_v_obeys_the_dynamics_and_costs_half_its_square_more(case):
+    rng = np.random.default_rng(1)
+    model, N, M = case.model, case.horizon, case.max_obstacles
+    c = Condensed(case)
+    x0, ref = rng.normal(size=model.nx), rng.normal(size=(N + 1, model.nx))
+    free = c.start(x0, ref)
+
+    def cost(y):
+        path = rollout(model.step, x0, y[c.u].reshape(N, model.nu))
+        p = y[c.p].reshape(N, model.dim) + ref[1:, model.position]
+        np.testing.assert_allclose(path.states[1:, model.position], p, atol=1e-9)
+        np.testing.assert_allclose(c.deviations(path.inputs), path.states[1:] - ref[1:], atol=1e-9)
+        return case.cost(path.states, path.inputs, y[c.s], ref)
+
+    assert c.moving_sizes == (M if case.margin.lower < case.margin.reference else 0)
+    for _ in range(5):
+        v = rng.normal(size=c.response.shape[1])
+        assert cost(free + c.response @ v) - cost(free) == pytest.approx(v @ v / 2, rel=1e-7)
+
+
+def test_costates_are_the_adjoint_of_the_rollout():
+    """d (w'e) / d u = B' nu where D' nu = w, by finite differences of the rollout."""
+    rng = np.random.default_rng(2)
+    case = problem(6)
+    c = Condensed(case)
+    c.start(rng.normal(size=4), rng.normal(size=(7, 4)))
+    w, u = rng.normal(size=(6, 4)), rng.normal(size=(6, 2))
+    gradient = c.costates(w) @ case.model.B
+    for i, k in np.ndindex(6, 2):
+        step = np.zeros((6, 2))
+        step[i, k] = 1.0
+        change = np.vdot(w, c.deviations(u + step) - c.deviations(u - step)) / 2
+        assert gradient[i, k] == pytest.approx(change, abs=1e-9)
+
+
+def test_without_an_input_weight_there_may_be_no_condensed_problem():
+    """A second input that does nothing and costs nothing: the sparse way still has an answer."""
+    model = DoubleIntegrator(0.2)
+    B = np.column_stack([model.B, np.zeros(4)])
+    idle = LinearModel(model.A, B, 0.2, model.position)
+    case = problem(8, model=idle, R=[0.001, 0.001, 0.0])
+    solver = SCP(case)
+    assert solver._condensed is None
+    plan = solver.solve(np.zeros(4), straight_reference(8), [obstacle(8, (1.5, 0.1))])
+    assert plan.ok
+
+
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+@pytest.mark.parametrize("s_min", [S_REF, 0.5])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_condensed_and_the_sparse_descent_end_in_plans_of_equal_standing(
+    kind, s_min, inflation
+):
+    """From the end of one the other does not move: same plan, same forces."""
+    case = instance(kind, 20, inflation, s_min, 0)
+    fast = SCP(case.problem, Settings(sides=False))
+    guess = Trajectory(case.x_ref, np.zeros((20, 2)))
+    plan = fast.solve(case.x0, case.x_ref, case.obstacles, guess)
+    assert set(plan.qps) <= {"kkt", "daqp"}
+    slow = SCP(case.problem, SPARSE).solve(case.x0, case.x_ref, case.obstacles, plan.iterate)
+    assert plan.status is slow.status is Status.CONVERGED
+    assert slow.cost == pytest.approx(plan.cost, rel=1e-6)
+    np.testing.assert_allclose(slow.X, plan.X, atol=2e-3)
+    for name in ("obstacles", "inputs", "margin", "dynamics"):
+        mine, theirs = getattr(plan.multipliers, name), getattr(slow.multipliers, name)
+        np.testing.assert_allclose(mine, theirs, atol=1e-3 * (1 + np.abs(theirs).max()))

@@ -1,0 +1,205 @@
+"""From convex steps to Newton's: the series, its sum, and what is done where there is none."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instances import DT, KINDS, S_REF, instance, obstacle, problem, straight_reference
+
+from scp_mpc import (
+    SCP,
+    DoubleIntegrator,
+    ObstaclePrediction,
+    QPSettings,
+    Settings,
+    Status,
+    Trajectory,
+)
+from scp_mpc.safety import NoGoSets
+from scp_mpc.safety.inflation import AxesInflation, ExactInflation
+from scp_mpc.safety.tangents import inverse_root, tangents
+from scp_mpc.solver import newton
+from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram
+from scp_mpc.solver.curvature import summed
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
+
+
+def bent(scale, seed=0, n=8, k=2, q=3):
+    """A program's solution, and bends that make the convex steps shrink or grow."""
+    rng = np.random.default_rng(seed)
+    A, L = rng.normal(size=(k, n)), scale * rng.normal(size=(q, n)) / np.sqrt(n)
+    p = CondensedProgram(np.full(n, -1e3), np.full(n, 1e3), A, np.ones(k))
+    held = ActiveSetSolver(np.eye(n)).solve(p, np.concatenate([np.zeros(n, int), -np.ones(k, int)]))
+    return held, L, rng.normal(size=n), np.eye(n) - np.linalg.pinv(held.rows) @ held.rows
+
+
+def test_the_sum_is_that_of_the_convex_steps():
+    held, L, d, P = bent(0.6)
+    T = P @ L.T @ L
+    assert np.abs(np.linalg.eigvals(T)).max() < 1
+    steps, total = P @ d, np.zeros(8)
+    for _ in range(5000):
+        total, steps = total + steps, T @ steps
+    whole = summed(held, L, L @ (P @ d))
+    np.testing.assert_allclose(whole.v - held.v, total - P @ d, atol=1e-9)
+    # The active set holds all along, at forces that keep the balance.
+    np.testing.assert_allclose(held.rows @ whole.v, held.rows @ held.v, atol=1e-9)
+    turned = L.T @ np.linalg.solve(np.eye(3) - L @ P @ L.T, L @ (P @ d))
+    np.testing.assert_allclose(whole.v, whole.force @ np.vstack([np.eye(8), held.rows]) + turned)
+
+
+def test_there_is_no_sum_where_the_steps_grow():
+    held, L, d, P = bent(3.0)
+    assert np.abs(np.linalg.eigvals(P @ L.T @ L)).max() > 1
+    assert summed(held, L, L @ (P @ d)) is None
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", [ExactInflation, AxesInflation])
+def test_the_bend_is_the_second_derivative(kind, dim):
+    """Against differences of gradient and slope; for the axes in the position only."""
+    rng = np.random.default_rng(dim)
+    K, inflation = 7, kind(S_REF)
+    G = 0.4 * rng.normal(size=(K, dim, dim))
+    direction = rng.normal(size=(K, dim))
+    mu = rng.normal(size=(K, dim))
+    p = mu + 2.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    sets = NoGoSets.pairs(mu, G @ np.swapaxes(G, 1, 2), rng.uniform(0.2, 0.5, K))
+    s, start = rng.uniform(1, 3, K), np.ones((K, dim))
+
+    def linear(p, s):
+        spaces = inflation.linearise(sets, p[:, None], s, start)
+        return spaces, np.concatenate([spaces.normal[:, 0], spaces.slope], axis=1)
+
+    spaces, _ = linear(p, s)
+    L = inflation.bend(sets, s, spaces)[:, 0]
+    assert L.shape == (K, dim + 1, dim - 1)
+    hessian, h = L @ np.swapaxes(L, 1, 2), 1e-5
+    for a in range(dim + (kind is ExactInflation)):
+        dp, ds = (h * np.eye(dim)[a], 0.0) if a < dim else (0.0, h)
+        change = (linear(p + dp, s + ds)[1] - linear(p - dp, s - ds)[1]) / (2 * h)
+        rows = slice(None) if kind is ExactInflation else slice(dim)
+        np.testing.assert_allclose(hessian[:, rows, a], change[:, rows], atol=1e-7)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_tangents_complete_a_basis(dim):
+    n = np.random.default_rng(0).normal(size=(50, dim))
+    n = np.vstack([n, np.eye(dim), -np.eye(dim)])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    basis = np.concatenate([n[..., None], tangents(n)], axis=-1)
+    unit = np.broadcast_to(np.eye(dim), basis.shape)
+    np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ basis, unit, atol=1e-12)
+    M = np.array([[[2.0, 0.5], [0.5, 1.0]]])[:, : dim - 1, : dim - 1]
+    root = inverse_root(M)
+    np.testing.assert_allclose(
+        root @ np.swapaxes(root, 1, 2) @ M, np.eye(dim - 1)[None], atol=1e-12
+    )
+
+
+def plain(monkeypatch):
+    """Take away the sums and the leaps: convex steps only."""
+    monkeypatch.setattr(newton.Newton, "_ahead", lambda *_: None)
+
+
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+def test_summed_and_plain_reach_the_same_optimum_the_former_sooner(monkeypatch, inflation):
+    cases = [
+        instance(kind, 20, inflation, S_REF, s) for kind, s in itertools.product(KINDS, (0, 1))
+    ]
+    settings = Settings(sides=False, max_iterations=2000)
+
+    def solve(case):
+        guess = Trajectory(case.x_ref, np.zeros((20, 2)))
+        return SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
+
+    quick = [solve(case) for case in cases]
+    plain(monkeypatch)
+    slow = [solve(case) for case in cases]
+    assert all(plan.status is Status.CONVERGED for plan in quick + slow)
+    for a, b in zip(quick, slow, strict=True):
+        assert a.cost == pytest.approx(b.cost, rel=1e-5)
+    assert sum(p.iterations for p in quick) < 0.4 * sum(p.iterations for p in slow)
+
+
+def exact(limit):
+    qp = QPSettings(accuracy=1e-12)
+    return Settings(sides=False, tolerance=1e-12, max_iterations=limit, qp=qp)
+
+
+def test_convergence_is_quadratic_at_the_end():
+    """From near the optimum, each residual is about the square of the one before."""
+    case = instance("ahead", 20, "exact", S_REF, 0)
+    tight = Settings(sides=False, tolerance=1e-7)
+    plan = SCP(case.problem, tight).solve(case.x0, case.x_ref, case.obstacles)
+    rng = np.random.default_rng(0)
+    X = plan.X.copy()
+    X[1:, [0, 2]] += 0.02 * rng.normal(size=(20, 2))
+    residuals = []
+    for limit in (1, 2, 3):
+        solver = SCP(case.problem, exact(limit))
+        # The condensed engine alone: the sparse one would take over where this one runs out.
+        step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
+        solver._engine.begin(step, Stopwatch())
+        end = solver._engine.descend(replace(plan.iterate, states=X), limit)
+        residuals.append(end.residuals.worst)
+    assert residuals[1] < 20 * residuals[0] ** 1.7
+    assert residuals[2] < 1e-9
+
+
+def head_on():
+    """Straight behind a slow obstacle, everything symmetric: trailing is a saddle point."""
+    case, ref = problem(30, "exact"), straight_reference(30, 2.0)
+    behind = ref.copy()
+    behind[:, 0] = np.minimum(ref[:, 0], 1.5)
+    behind[1:, 2] = 1e-6
+    return case, ref, [obstacle(30, (3.0, 0.0), (0.3, 0.0))], Trajectory(behind, np.zeros((30, 2)))
+
+
+def test_leaps_leave_a_saddle_sooner(monkeypatch):
+    case, ref, slow, guess = head_on()
+    settings = Settings(sides=False, max_iterations=500)
+    quick = SCP(case, settings).solve(ref[0], ref, slow, guess)
+    plain(monkeypatch)
+    creeping = SCP(case, settings).solve(ref[0], ref, slow, guess)
+    assert quick.status is Status.CONVERGED
+    assert quick.cost <= creeping.cost * (1 + 1e-6)
+    assert quick.iterations < creeping.iterations
+
+
+def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
+    """Leap a metre aside after every convex step: the plan must be as good as without."""
+    case = instance("ahead", 20, "exact", S_REF, 0)
+    guess = Trajectory(case.x_ref, np.zeros((20, 2)))
+    settings = Settings(sides=False, max_iterations=2000)
+    plain(monkeypatch)
+    expected = SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
+    leapt = []
+
+    def astray(self, *given):
+        leapt.append(given)
+        y = self._step.y(given[2].v)
+        y[self._step.condensed.p] += 1.0
+        return y
+
+    monkeypatch.setattr(newton.Newton, "_ahead", astray)
+    plan = SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
+    assert leapt
+    assert plan.status is Status.CONVERGED
+    assert plan.cost <= expected.cost * (1 + 1e-6)
+
+
+def test_a_spatial_plan_converges_as_quickly():
+    model = DoubleIntegrator(DT, dim=3)
+    case = problem(15, "exact", 0.5, model=model, Q=[1.0, 0.1] * 3, R=[0.01] * 3)
+    ref = np.zeros((16, 6))
+    ref[:, 0], ref[:, 1] = 0.4 * np.arange(16), 2.0
+    Sigma = np.diag([0.04, 0.01, 0.02])
+    ball = ObstaclePrediction(np.tile([3.0, 0.05, 0.1], (16, 1)), Sigma, 0.2)
+    plan = SCP(case, Settings(sides=False)).solve(ref[0], ref, [ball])
+    assert plan.status is Status.CONVERGED
+    assert plan.iterate.touches
+    assert plan.iterations <= 15
+    assert set(plan.qps) <= {"kkt", "daqp"}
