@@ -21,8 +21,8 @@ format: $(VENV)/.dev  ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/.dev  ## time a control step against the report's method and IPOPT
-	$(BIN)/python benchmarks/horizon_timing.py --out benchmarks/results
+bench: $(VENV)/.dev  ## all benchmarks; tables, figures and numbers go to benchmarks/results
+	$(BIN)/python benchmarks/run.py --out benchmarks/results
 
 clean:
 	rm -rf $(VENV) $(OUT) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-_PACKAGES = ("scp-mpc", "numpy", "scipy", "osqp", "piqp", "casadi")
+_PACKAGES = ("scp-mpc", "numpy", "scipy", "osqp", "daqp", "piqp", "casadi")
 _HERE = Path(__file__).resolve().parent
 
 

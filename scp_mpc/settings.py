@@ -54,6 +54,8 @@ class Settings:
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
         rivals: How many of the ways past it to follow to the end; all are ranked.
+        deadline: Seconds after which no iteration is begun once there is a plan; other sides are
+            left out when half of them are gone. None: take the time it takes.
         qp: Settings of the quadratic program's solvers.
     """
 
@@ -64,6 +66,7 @@ class Settings:
     sides: bool = True
     sides_interval: int = 1
     rivals: int = 1
+    deadline: float | None = None
     qp: QPSettings = field(default_factory=QPSettings)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,8 @@ class Settings:
         as_count("max_iterations", self.max_iterations)
         as_count("sides_interval", self.sides_interval)
         as_count("rivals", self.rivals)
+        if self.deadline is not None:
+            require_positive("deadline", self.deadline)
         require_flags(self, "condense", "acceleration", "sides")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")

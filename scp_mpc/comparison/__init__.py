@@ -3,11 +3,14 @@
 from scp_mpc.comparison.ipopt import Ipopt
 from scp_mpc.comparison.ours import Ours
 from scp_mpc.comparison.peer_plan import Peer, PeerMissingError, PeerPlan
+from scp_mpc.comparison.runner import BENCHMARKS, run
 from scp_mpc.comparison.sequence import RecordedStep, record
 from scp_mpc.comparison.slsqp import Slsqp
+from scp_mpc.comparison.staged import Staged
 from scp_mpc.comparison.violation import largest_violation
 
 __all__ = [
+    "BENCHMARKS",
     "Ipopt",
     "Ours",
     "Peer",
@@ -15,6 +18,8 @@ __all__ = [
     "PeerPlan",
     "RecordedStep",
     "Slsqp",
+    "Staged",
     "largest_violation",
     "record",
+    "run",
 ]

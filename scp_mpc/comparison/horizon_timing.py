@@ -1,22 +1,25 @@
 """How long one control step takes at the report's two horizons, solver by solver.
 
-For N = 8 and N = 30 (scenarios 2 and 1) a closed-loop run is recorded once. Every solver then
-solves its steps from the same guess, in turns of shuffled order, so that the machine's noise and
-the state in which one solver leaves its caches to the next hit all alike:
+For N = 8 and N = 30 (scenarios 2 and 1), and where asked for 5 and 12 obstacles, a closed-loop run
+is recorded once. Every solver then solves its steps from the same guess, in turns of shuffled
+order, so that the machine's noise and the state in which one solver leaves its caches to the next
+hit all alike:
 
     scp_mpc                 from the guess, on the side of the guess: like for like
     scp_mpc (both sides)    default settings, trying the other sides at every step
-    ipopt, slsqp            see their modules
+    scp_mpc (osqp)          sparse programs, OSQP first and PIQP for what it does not finish
+    scp_mpc (osqp alone)    the same without PIQP
+    scp_mpc (piqp)          sparse programs, PIQP first
+    others                  see their modules
 
 Only scp_mpc uses the multipliers of the guess; the peers have no use for them.
 """
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,25 +29,31 @@ from scp_mpc.comparison.ipopt import Ipopt
 from scp_mpc.comparison.one_thread import in_one_thread
 from scp_mpc.comparison.ours import Ours
 from scp_mpc.comparison.peer_plan import Peer, PeerMissingError
+from scp_mpc.comparison.progress import progress
 from scp_mpc.comparison.sequence import RecordedStep, record
 from scp_mpc.comparison.slsqp import Slsqp
+from scp_mpc.comparison.staged import SOLVERS, Staged
 from scp_mpc.comparison.timing_figure import timing_figure
 from scp_mpc.comparison.timing_table import timing_table
 from scp_mpc.problem import Problem
 from scp_mpc.provenance import provenance
-from scp_mpc.settings import Settings
+from scp_mpc.settings import QPSettings, Settings
+from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
 NAME = "horizon_timing"  # of the files
 SLOW_STEPS = 20
-_SCENARIOS = ("scenario-2", "scenario-1")
-_SHORT = 10  # horizon up to which SLSQP is quick enough for every step
+_SCENARIOS: tuple[Scenario | Crowd, ...] = (SCENARIOS["scenario-2"], SCENARIOS["scenario-1"])
+CROWDS = (Crowd(30, 5), Crowd(30, 12))
+_SHORT = 10  # horizon up to which every solver is quick enough for every step
+_SLOW = {"slsqp": 1, "sqp-osqp": 5, "sqp-hpipm": 5, "scp_mpc (osqp alone)": 5}  # and their share
+_NOT_FOR_CROWDS = ("slsqp", "sqp-osqp")  # minutes per step
 
 _log = logging.getLogger(__name__)
 
 
 def measure(
-    scenario: Scenario,
+    scenario: Scenario | Crowd,
     steps: int,
     seed: int = 0,
     slow_steps: int = SLOW_STEPS,
@@ -56,17 +65,17 @@ def measure(
         scenario: Whose problem, with the report's inflation.
         steps: Number of control steps.
         seed: Seed of the disturbance and of the solvers' order.
-        slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: this many at most.
+        slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: about this many.
         advance: Called twice per step, when it is recorded and when it is solved by all.
     """
     as_count("steps", steps)
     as_count("slow_steps", slow_steps)
-    problem = scenario.problem()
+    problem = scenario.problem("axes")
     sequence = record(scenario, steps, seed, problem, advance=advance)
     peers = _peers(problem)
     every = dict.fromkeys(peers, 1)
     if problem.horizon > _SHORT:
-        every["slsqp"] = -(-steps // slow_steps)
+        every |= {name: max(1, steps // (slow_steps * share)) for name, share in _SLOW.items()}
     obstacles = len(sequence[0].obstacles)
     contest = [
         Attempts(name, problem.horizon, obstacles, len(range(0, steps, every[name])), {})
@@ -92,6 +101,7 @@ def main(
     seed: int,
     slow_steps: int = SLOW_STEPS,
     echo: Callable[[str], None] = _log.info,
+    crowds: bool = False,
 ) -> None:
     """Run the benchmark in a process of one thread, echo its table and write its files.
 
@@ -102,8 +112,11 @@ def main(
         seed: Seed of the disturbance.
         slow_steps: See `measure`.
         echo: Takes the Markdown table.
+        crowds: Five and twelve obstacles too.
     """
-    contests = in_one_thread(_contests, _SCENARIOS, steps, seed, slow_steps)
+    contests = in_one_thread(
+        _contests, _SCENARIOS + (CROWDS if crowds else ()), steps, seed, slow_steps
+    )
     summary = [row for contest in contests for row in rows(contest)]
     for row in summary:
         if row["median_ms"] is None:
@@ -121,44 +134,44 @@ def main(
         timing_figure(contests).savefig(out / f"{NAME}.png", dpi=150)
 
 
-def _contests(names: Sequence[str], steps: int, seed: int, slow_steps: int) -> list[list[Attempts]]:
+def _contests(
+    scenarios: Sequence[Scenario | Crowd], steps: int, seed: int, slow_steps: int
+) -> list[list[Attempts]]:
     """One contest per scenario, with a progress bar on a terminal."""
-    with _progress(2 * steps * len(names)) as advance:
-        return [measure(SCENARIOS[name], steps, seed, slow_steps, advance) for name in names]
+    with progress(2 * steps * len(scenarios)) as advance:
+        return [measure(one, steps, seed, slow_steps, advance) for one in scenarios]
 
 
 def _peers(problem: Problem) -> dict[str, Peer | None]:
     """The solvers by name; None for one that is not installed, whose row is kept."""
-    ipopt: Peer | None = None
-    try:
-        ipopt = Ipopt(problem)
-    except PeerMissingError as error:
-        _log.warning("ipopt has no results: %s", error)
-    return {
+    quick = {
         "scp_mpc": Ours(problem, Settings(sides=False)),
         "scp_mpc (both sides)": Ours(problem, challenge=True),
-        "ipopt": ipopt,
-        "slsqp": Slsqp(problem),
     }
+    sparse = {
+        "osqp": QPSettings(),
+        "osqp alone": QPSettings(rescue=False, max_iterations=4000),
+        "piqp": QPSettings(cold=1e-300),
+    }
+    for name, qp in sparse.items():
+        quick[f"scp_mpc ({name})"] = Ours(problem, Settings(sides=False, condense=False, qp=qp))
+    peers: dict[str, Peer | None] = {**quick}
+    builders: dict[str, Callable[[], Peer]] = {
+        "ipopt": lambda: Ipopt(problem),
+        **{name: partial(Staged, problem, name) for name in SOLVERS},
+        "slsqp": lambda: Slsqp(problem),
+    }
+    for name, build in builders.items():
+        if problem.max_obstacles > 1 and name in _NOT_FOR_CROWDS:
+            continue
+        try:
+            peers[name] = build()
+        except PeerMissingError as error:
+            peers[name] = None
+            _log.warning("%s has no results: %s", name, error)
+    return peers
 
 
 def _warm_up(peer: Peer | None, step: RecordedStep) -> None:
     if peer is not None:
         peer.solve(step.x0, step.x_ref, step.obstacles, step.guess)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[], object]]:
-    """A progress bar on a terminal, if there is one and tqdm is installed."""
-    bar: Any = None
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        _log.debug("tqdm is not installed: no progress bar")
-    else:
-        bar = tqdm(total=total, unit="step", disable=None)
-    try:
-        yield (lambda: None) if bar is None else bar.update
-    finally:
-        if bar is not None:
-            bar.close()

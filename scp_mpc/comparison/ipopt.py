@@ -70,7 +70,7 @@ class Ipopt:
             "ipopt.constr_viol_tol": tolerance,
             "ipopt.max_iter": max_iterations,
         }
-        casadi = _import_casadi()
+        casadi = import_casadi()
         program = _program(casadi, problem, self._unknowns, self._lifted)
         self._solver = casadi.nlpsol("ipopt", "ipopt", program, options)
 
@@ -96,7 +96,7 @@ class Ipopt:
         equal = np.zeros(problem.horizon * problem.model.nx)
         result = self._solver(
             x0=z,
-            p=_parameters(step),
+            p=parameters(step),
             lbx=lower,
             ubx=upper,
             lbg=np.concatenate([equal, outside]),
@@ -126,7 +126,12 @@ class Ipopt:
         return theta.ravel(), np.where(on, np.inf, 0.0).ravel()
 
 
-def _import_casadi() -> Any:
+def import_casadi() -> Any:
+    """CasADi, without its warnings.
+
+    Raises:
+        PeerMissingError: It is not installed.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -136,8 +141,8 @@ def _import_casadi() -> Any:
     return casadi
 
 
-def _parameters(step: StepData) -> FloatArray:
-    """In the order of `_program`: x0, x_ref, mu, R, sigma, r."""
+def parameters(step: StepData) -> FloatArray:
+    """All that changes from step to step, in a row: x0, x_ref, mu, R, sigma, r."""
     sets = step.sets
     data = (step.x0, step.x_ref[1:], sets.means, sets.rotations, sets.deviations, sets.radii)
     return np.concatenate([part.ravel() for part in data])

@@ -1,13 +1,17 @@
 """The control steps of one closed-loop run, so that every solver gets the same problems."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import repeat
+
+import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.control.mpc import MPC
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
-from scp_mpc.simulation.closed_loop import simulate
+from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import Scenario
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.scp import SCP
@@ -32,20 +36,39 @@ class RecordedStep:
 
 
 def record(
-    scenario: Scenario,
+    scenario: Scenario | Crowd,
     steps: int,
     seed: int = 0,
     problem: Problem | None = None,
     settings: Settings | None = None,
     advance: Callable[[], object] = lambda: None,
 ) -> list[RecordedStep]:
-    """Run the controller in closed loop and keep what it solved; arguments as for `simulate`."""
-    run = simulate(scenario, problem, settings, steps, seed, advance)
-    first = SCP(run.problem, settings).solve(run.states[0], scenario.states(0))
-    guesses = [first.iterate] + [plan.iterate.shifted(run.problem.model) for plan in run.plans]
-    return [
-        RecordedStep(x0, scenario.states(k), (obstacle,), guess)
-        for k, (x0, obstacle, guess) in enumerate(
-            zip(run.states, run.predictions, guesses, strict=False)
-        )
-    ]
+    """Run the controller in closed loop and keep what it solved.
+
+    Args:
+        scenario: What to run.
+        steps: Number of control steps.
+        seed: Seed of the scenario's disturbance, if it has one.
+        problem: What to solve; the scenario's own if None.
+        settings: How to solve it.
+        advance: Called after each step, for a progress bar.
+    """
+    problem = scenario.problem() if problem is None else problem
+    mpc = MPC(problem, settings)
+    x, wind = scenario.start(), _wind(scenario, seed, problem.model.nx)
+    guess = SCP(problem, settings).solve(x, scenario.states(0)).iterate
+    recorded = []
+    for k in range(steps):
+        x_ref, obstacles = scenario.states(k), tuple(scenario.predictions(k))
+        recorded.append(RecordedStep(x, x_ref, obstacles, guess))
+        plan = mpc.step(x, x_ref, obstacles)
+        x = problem.model.step(x, plan.u0) + next(wind)
+        guess = plan.iterate.shifted(problem.model)
+        advance()
+    return recorded
+
+
+def _wind(scenario: Scenario | Crowd, seed: int, size: int) -> Iterator[FloatArray]:
+    if isinstance(scenario, Crowd) or scenario.disturbance is None:
+        return repeat(np.zeros(size))
+    return iter(scenario.disturbance.samples(scenario.generator(seed)))

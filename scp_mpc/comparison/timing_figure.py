@@ -9,18 +9,25 @@ from matplotlib.ticker import FuncFormatter
 from scp_mpc.comparison.attempts import Attempts
 from scp_mpc.simulation.scenarios import DT
 
-# Okabe and Ito's colours, told apart by any eye; line styles help in print.
+# Okabe and Ito's colours, told apart by any eye; line styles tell apart those that share one.
 _STYLES = {
     "scp_mpc": ("#0072B2", "-"),
     "scp_mpc (both sides)": ("#56B4E9", "-"),
-    "ipopt": ("#D55E00", "--"),
-    "slsqp": ("#009E73", "-."),
+    "scp_mpc (osqp)": ("#0072B2", "--"),
+    "scp_mpc (osqp alone)": ("#0072B2", ":"),
+    "scp_mpc (piqp)": ("#0072B2", "-."),
+    "ipopt": ("#D55E00", "-"),
+    "fatrop": ("#E69F00", "-"),
+    "sqp-qrqp": ("#009E73", "-"),
+    "sqp-hpipm": ("#009E73", "--"),
+    "sqp-osqp": ("#009E73", ":"),
+    "slsqp": ("#000000", "-."),
 }
 
 
 def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
-    """Draw the share of steps solved within a time, for one contest per horizon."""
-    figure = Figure(figsize=(5.2 * len(contests), 4.4), layout="constrained")
+    """Draw the share of steps solved within a time, one panel per contest."""
+    figure = Figure(figsize=(max(5.2 * len(contests), 11), 5.0), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(contests), sharex=True, sharey=True, squeeze=False)[0]
     for axes, contest in zip(panels, contests, strict=True):
@@ -32,7 +39,7 @@ def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
                     label=attempts.solver,
                     color=colour,
                     linestyle=line,
-                    linewidth=2.2,
+                    linewidth=2.0,
                 )
         axes.axvline(1e3 * DT, color="black", linewidth=1.2, linestyle=":")
         axes.annotate(
@@ -47,11 +54,16 @@ def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
         )
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.set_title(f"N = {contest[0].horizon}", fontsize=14)
+        axes.set_title(_title(contest[0]), fontsize=14)
         axes.set_xlabel("time per control step [ms]", fontsize=13)
         axes.tick_params(labelsize=12)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("share of steps", fontsize=13)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=12, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=11, frameon=False)
     return figure
+
+
+def _title(attempts: Attempts) -> str:
+    crowd = f", {attempts.obstacles} obstacles" if attempts.obstacles > 1 else ", 1 obstacle"
+    return f"N = {attempts.horizon}{crowd}"

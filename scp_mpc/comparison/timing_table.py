@@ -13,13 +13,18 @@ _HEAD = (
 
 def timing_table(summary: Sequence[Row], origin: Mapping[str, str | int | None]) -> str:
     """Return the table of all rows, with a line on where they were measured."""
-    versions = ", ".join(f"{name} {origin[name] or 'missing'}" for name in ("osqp", "casadi"))
-    source = (
+    return "\n".join([_HEAD, *(_line(row) for row in summary), "", measured_on(origin)])
+
+
+def measured_on(origin: Mapping[str, str | int | None]) -> str:
+    """Return a line on machine, versions, commit and date."""
+    names = ("osqp", "daqp", "casadi")
+    versions = ", ".join(f"{name} {origin[name] or 'missing'}" for name in names)
+    return (
         f"Measured on {origin['machine']}, {origin['cores']} cores, one thread, "
         f"Python {origin['python']}, {versions}, "
         f"commit {origin['commit'] or 'unknown'}, {origin['date']}."
     )
-    return "\n".join([_HEAD, *(_line(row) for row in summary), "", source])
 
 
 def _line(row: Row) -> str:

@@ -1,6 +1,7 @@
 """Simulation: named scenarios and the closed loop."""
 
 from scp_mpc.simulation.closed_loop import ClosedLoop, simulate
+from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance
 from scp_mpc.simulation.scenarios import DT, SCENARIOS, STEPS, Scenario
 
@@ -10,6 +11,7 @@ __all__ = [
     "STEPS",
     "ClosedLoop",
     "CorrelatedDisturbance",
+    "Crowd",
     "Scenario",
     "simulate",
 ]

@@ -71,6 +71,10 @@ class Scenario:
         position, velocity = self.obstacle.position(time), self.obstacle.velocity(time)
         return self.predictor.predict(position, velocity, self.obstacle.radius, self.horizon, DT)
 
+    def predictions(self, step: int) -> list[ObstaclePrediction]:
+        """The same, as what `MPC.step` takes."""
+        return [self.prediction(step)]
+
     def generator(self, seed: int) -> np.random.Generator:
         """A generator of its own for each scenario, so that none depends on the others' order."""
         return np.random.default_rng([seed, *self.name.encode()])

@@ -27,6 +27,7 @@ from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
+_MANY = 200  # pairs beyond which sparse programs are quicker than dense ones
 
 
 class CondensedSCP:
@@ -87,6 +88,8 @@ class CondensedSCP:
         bounds, iterations = self._active_bounds(nominal), 0
         while True:
             near = self._near(at.path(y)[None], y[c.s], near)
+            if np.count_nonzero(near) > _MANY:
+                return None
             conflicts = Conflicts(data, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
             newton = Newton(at, conflicts, self._settings, goal)
@@ -115,6 +118,8 @@ class CondensedSCP:
         free = at.path(at.within_bounds[0])[None]
         nobody = np.zeros((data.count, len(paths[0])), dtype=np.bool_)
         near = self._near(np.concatenate([whole, free]), best.s, nobody)
+        if np.count_nonzero(near) > _MANY:
+            return []
         conflicts = Conflicts(data, self._condensed, near)
         with at.watch.linearising:
             a, b = conflicts.about(whole, best.s)

@@ -91,6 +91,8 @@ class Newton:
                 break
             if self._goal is not None and self._vain(iteration, point, self._goal):
                 return None
+            if self._step.watch.overdue():
+                break
             if isinstance(ahead, np.ndarray):
                 tangent, leaps, bold = self._conflicts.tangent(ahead), leaps + 1, True
             else:

@@ -1,9 +1,10 @@
-"""Any sparse QP solver that qpsolvers knows: a slow, obvious second opinion.
+"""Any QP solver that qpsolvers knows: a slow, obvious second opinion.
 
 It sets the other solver up afresh at each call, which is right for tests and comparisons and too
 slow for the loop, where `rescue.py` stands.
 """
 
+import warnings
 from time import perf_counter
 from typing import Any
 
@@ -29,10 +30,11 @@ class Oracle:
 
     def __init__(self, solver: str, **options: Any) -> None:
         """Check at construction that the solver is there."""
-        if solver not in qpsolvers.sparse_solvers:
-            there = ", ".join(qpsolvers.sparse_solvers)
+        if solver not in qpsolvers.available_solvers:
+            there = ", ".join(qpsolvers.available_solvers)
             raise InvalidArgumentError("solver", f"{solver!r} is none of the installed: {there}")
         self._solver, self._options = solver, options
+        self._dense = solver not in qpsolvers.sparse_solvers
 
     def solve(self, program: QuadraticProgram) -> QPSolution:
         """Solve `program`; rows with equal bounds become equations, infinite bounds vanish."""
@@ -43,14 +45,16 @@ class Oracle:
         below = np.flatnonzero(~same & np.isfinite(program.lower))
         equal = np.flatnonzero(same)
         problem = qpsolvers.Problem(
-            program.P,
+            self._matrix(program.P),
             program.q,
-            sparse.vstack([rows[above], -rows[below]], format="csc"),
+            self._matrix(sparse.vstack([rows[above], -rows[below]], format="csc")),
             np.concatenate([program.upper[above], -program.lower[below]]),
-            rows[equal].tocsc(),
+            self._matrix(rows[equal].tocsc()),
             program.lower[equal],
         )
-        found = qpsolvers.solve_problem(problem, self._solver, **self._options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the outcome is in `found`
+            found = qpsolvers.solve_problem(problem, self._solver, **self._options)
         x, y = np.full(len(program.q), np.nan), np.full(len(program.lower), np.nan)
         status = QPStatus.FAILED
         if found.found and found.x is not None and found.y is not None and found.z is not None:
@@ -60,3 +64,6 @@ class Oracle:
             y[above] += found.z[: len(above)]
             y[below] -= found.z[len(above) :]
         return QPSolution(x, y, status, 0, perf_counter() - began, self._solver)
+
+    def _matrix(self, matrix: sparse.csc_matrix) -> Any:
+        return matrix.toarray() if self._dense else matrix

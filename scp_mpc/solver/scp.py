@@ -35,6 +35,7 @@ from scp_mpc.trajectory import Trajectory
 
 # A rival must be better by this share, or the plan flickers between sides of equal cost.
 _HYSTERESIS = 0.001
+_SHARE = 0.5  # of the deadline, after which no other side is tried
 
 
 class SCP:
@@ -112,7 +113,7 @@ class SCP:
         nominal: Callable[[], Iterate] | None,
         challenge: bool,
     ) -> Plan:
-        watch = Stopwatch()
+        watch = Stopwatch(self.settings.deadline)
         step = StepData.read(self.problem, x0, x_ref, obstacles)
         if nominal is None:
             self.forget()
@@ -124,7 +125,7 @@ class SCP:
             start = self._engine.free() if nominal is None else nominal()
             best = self._descend(step, watch, start)
             wanted = not best.status.ok or (challenge and best.iterate.touches)
-            if self.settings.sides and wanted:
+            if self.settings.sides and wanted and not watch.overdue(_SHARE):
                 best, tried, switched = self._challenge(step, best)
         return self._plan(step, best, tried, switched, watch)
 
@@ -134,7 +135,7 @@ class SCP:
         if self._condensed is None:
             return self._sparse.descend(nominal, limit)
         best = self._condensed.descend(nominal, limit)
-        if best is not None and best.status.certified:
+        if best is not None and (best.status.certified or watch.overdue()):
             return best
         self._sparse.begin(step, watch)
         other = self._sparse.descend(nominal, limit)
@@ -151,7 +152,7 @@ class SCP:
         starts = self._engine.glimpses(present, [side.path for side in sides])
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
-            for side, start in zip(sides, starts, strict=True)
+            for side, start in zip(sides, starts, strict=False)  # none if they are too many
         )
         goal, switched = best, False
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order

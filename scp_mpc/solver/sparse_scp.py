@@ -103,6 +103,8 @@ class SparseSCP:
         residuals = self._linearise_about(iterate)
         acceleration = Anderson(iterate, self._problem.model.position)
         while residuals.worst > tolerance and iterations < limit:
+            if iterations and self.watch.overdue():
+                break
             convex = self._improve(iterate, residuals, acceleration)
             if convex is None:
                 break

@@ -1,5 +1,6 @@
 """Where the time of one control step goes."""
 
+from math import inf
 from time import perf_counter
 from types import TracebackType
 
@@ -28,7 +29,10 @@ class Lap:
 
 
 class Stopwatch:
-    """Laps of one control step.
+    """Laps of one control step, and its deadline.
+
+    Args:
+        deadline: Seconds after which the step is overdue; None for never.
 
     Attributes:
         linearising: Geometry of the obstacles.
@@ -36,8 +40,9 @@ class Stopwatch:
         inside: The part of `solving` spent in the QP solvers themselves.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, deadline: float | None = None) -> None:
         """Begin the step."""
+        self._deadline = inf if deadline is None else deadline
         self.linearising, self.solving, self.inside = Lap(), Lap(), Lap()
         self._began = perf_counter()
 
@@ -45,3 +50,7 @@ class Stopwatch:
     def elapsed(self) -> float:
         """Seconds since the step began."""
         return perf_counter() - self._began
+
+    def overdue(self, share: float = 1.0) -> bool:
+        """Whether that share of the time is gone."""
+        return self.elapsed > share * self._deadline
