@@ -12,9 +12,11 @@ from scp_mpc import (
     MPC,
     SCP,
     ConcurrentUseError,
+    InvalidArgumentError,
     Iterate,
     ObstaclePrediction,
     Settings,
+    Status,
 )
 
 NAN, INF = np.nan, np.inf
@@ -212,3 +214,26 @@ def test_sides_are_tried_at_first_contact_and_then_at_intervals():
             mpc.reset()
         pattern = [k % interval == 0 for k in range(7)]
         assert tried == pattern + pattern
+
+
+def test_a_deadline_drops_other_sides_first_then_iterations():
+    """Past the deadline after the first program: what there is, never nothing."""
+    case, ref = problem(20), straight_reference(20)
+    blocking = [obstacle(20, (3.0, 0.1), (0.5, 0.0))]
+    patient = SCP(case).solve(ref[0], ref, blocking)
+    assert patient.candidates
+    hurried = SCP(case, Settings(deadline=1e-9)).solve(ref[0], ref, blocking)
+    assert hurried.candidates == ()
+    assert hurried.iterations == 1
+    assert hurried.status is Status.FEASIBLE
+    sparse = SCP(case, Settings(deadline=1e-9, condense=False)).solve(ref[0], ref, blocking)
+    assert (sparse.iterations, sparse.candidates) == (1, ())
+    # The free plan is no shortcut's victim: it takes no iteration at all.
+    clear = SCP(case, Settings(deadline=1e-9)).solve(ref[0], ref)
+    assert clear.status is Status.CONVERGED
+
+
+@pytest.mark.parametrize("deadline", [0.0, -1.0, NAN, "soon", True])
+def test_deadlines_are_positive_seconds(deadline):
+    with pytest.raises(InvalidArgumentError, match="deadline"):
+        Settings(deadline=deadline)

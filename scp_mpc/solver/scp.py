@@ -26,7 +26,7 @@ from scp_mpc.solver.condensed_scp import CondensedSCP
 from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.plan import Candidate, Plan, Timing
+from scp_mpc.solver.plan import Candidate, Plan, Status, Timing
 from scp_mpc.solver.sides import Passing, candidates, same_way
 from scp_mpc.solver.sparse_scp import SparseSCP
 from scp_mpc.solver.step_data import StepData
@@ -135,7 +135,7 @@ class SCP:
         if self._condensed is None:
             return self._sparse.descend(nominal, limit)
         best = self._condensed.descend(nominal, limit)
-        if best is not None and (best.status.certified or watch.overdue()):
+        if best is not None and (best.status is not Status.VIOLATING or watch.overdue()):
             return best
         self._sparse.begin(step, watch)
         other = self._sparse.descend(nominal, limit)
