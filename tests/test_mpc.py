@@ -233,7 +233,7 @@ def test_a_deadline_drops_other_sides_first_then_iterations():
     assert clear.status is Status.CONVERGED
 
 
-@pytest.mark.parametrize("deadline", [0.0, -1.0, NAN, "soon", True])
+@pytest.mark.parametrize("deadline", [0.0, -1.0, NAN, "soon"])
 def test_deadlines_are_positive_seconds(deadline):
     with pytest.raises(InvalidArgumentError, match="deadline"):
         Settings(deadline=deadline)
