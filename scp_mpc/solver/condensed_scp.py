@@ -72,6 +72,10 @@ class CondensedSCP:
         """The plan that ignores the obstacles, which may not be clear of them."""
         return self._iterate(self._at.free_point(), np.inf)
 
+    def free_path(self) -> FloatArray:
+        """Its positions (N, d)."""
+        return self._at.path(self._at.within_bounds[0])[1:]
+
     def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
         """Descend from a nominal plan; None if given up, or if a program could not be solved.
 
@@ -115,9 +119,8 @@ class CondensedSCP:
         at, data = self._at, self._at.data
         whole = np.empty((len(paths), len(data.x_ref), len(self._position)))
         whole[:, 0], whole[:, 1:] = data.x0[self._position], paths
-        free = at.path(at.within_bounds[0])[None]
-        nobody = np.zeros((data.count, len(paths[0])), dtype=np.bool_)
-        near = self._near(np.concatenate([whole, free]), best.s, nobody)
+        known = np.stack([at.path(at.within_bounds[0]), best.states[:, self._position]])
+        near = self._near(known, best.s, np.zeros((data.count, len(paths[0])), dtype=np.bool_))
         if np.count_nonzero(near) > _MANY:
             return []
         conflicts = Conflicts(data, self._condensed, near)

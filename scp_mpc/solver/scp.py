@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import Lock
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import BoolArray
@@ -145,10 +146,10 @@ class SCP:
         self, step: StepData, best: Descent
     ) -> tuple[Descent, tuple[Candidate, ...], bool]:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        free = self._engine.free()
+        full = np.full(self.problem.max_obstacles, self.problem.margin.reference)
         here = self._passing(best.iterate, best.iterate.touched[: step.count])
-        sides = candidates(step, free.states[1:, self.problem.model.position], here.path, free.s)
-        present = replace(best.iterate, s=free.s)
+        sides = candidates(step, self._engine.free_path(), here.path, full)
+        present = replace(best.iterate, s=full)
         starts = self._engine.glimpses(present, [side.path for side in sides])
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)

@@ -80,6 +80,10 @@ class SparseSCP:
         nominal = self._subproblem.resting(self.step.x_ref)
         return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
 
+    def free_path(self) -> FloatArray:
+        """Its positions (N, d)."""
+        return self.free().states[1:, self._problem.model.position]
+
     def glimpses(self, best: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
         """Solve one program about each path (N, d)."""
         position = self._problem.model.position
