@@ -3,9 +3,10 @@
     minimise |v|^2 / 2   subject to   lower <= F v <= upper,   A v >= b
 
 From the active set of the last plan a dual active-set method needs one or two changes, each a
-rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). Bounds that neither
-the guess nor the free plan touches are left out until a solution breaks them. What DAQP returns is
-taken only as a guess of the active set: `_settled` then solves for exactly that set.
+rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). Where bounds are many,
+those that neither the guess nor the free plan touches are left out until a solution breaks them.
+What DAQP returns is taken only as a guess of the active set: `_settled` then solves for exactly
+that set.
 
 Notation:
     v       (nv,)       inputs and sizes in coordinates that make the Hessian the identity
@@ -28,6 +29,7 @@ _INFINITY = 1e30  # DAQP's own
 _YIELDING = 1e6  # metres per unit force beyond the cap: as good as a pure L1 penalty
 _ACCURACY = 1e-9  # of a constraint, in its own unit
 _FEW = 4  # variables per row beyond which a program is solved in the span of its rows
+_SMALL = 128  # number of bounds up to which all are taken at once
 _ATTEMPTS = 3  # programs with ever more bounds before all of them are taken
 _RIDGE = 1e-12  # relative to the largest diagonal entry
 
@@ -133,7 +135,7 @@ class ActiveSetSolver:
         """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that matter."""
         nf, K = len(self._F), len(program.b)
         lower, upper = program.lower, program.upper
-        within = (active[:nf] != 0) | (lower > 0) | (upper < 0)
+        within = (active[:nf] != 0) | (lower > 0) | (upper < 0) | (nf <= _SMALL)
         sense = np.where(active < 0, _LOWER, active).astype(np.intc)
         if np.isfinite(cap):
             sense[nf:] |= _SOFT
