@@ -285,7 +285,7 @@ def test_slsqp_skips_steps_at_long_horizons(monkeypatch):
     contest = measure(SCENARIOS["scenario-2"], steps=4, slow_steps=2)
     seen = {a.solver: list(a.plans) for a in contest}
     assert seen["slsqp"] == [0, 2]
-    assert seen["ipopt"] == seen["scp_mpc"] == seen["sqp-osqp"] == [0, 1, 2, 3]
+    assert seen["ipopt"] == seen["scp_mpc"] == seen["fatrop"] == [0, 1, 2, 3]
     assert {row["solver"]: row["steps"] for row in rows(contest)}["slsqp"] == 2
 
 

@@ -3,8 +3,8 @@
     minimise |v|^2 / 2   subject to   lower <= F v <= upper,   A v >= b
 
 From the active set of the last plan a dual active-set method needs one or two changes, each a
-rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). Where bounds are many,
-those that neither the guess nor the free plan touches are left out until a solution breaks them.
+rank-one update in compiled code (DAQP: Arnstrom, Bemporad and Axehill, 2022). Where there are many
+bounds, those that neither guess nor free plan touch are left out until a solution breaks them.
 What DAQP returns is taken only as a guess of the active set: `_settled` then solves for exactly
 that set.
 
