@@ -16,22 +16,21 @@ _MARKERS = "osD^vPX"
 
 def scaling_figure(table: Sequence[dict[str, Any]], fitted: dict[str, float]) -> Figure:
     """Draw one curve per number of obstacles over N, and one per horizon over the obstacles."""
-    figure = Figure(figsize=(12.5, 5.2), layout="constrained")
+    figure = Figure(figsize=(12.5, 6.0), layout="constrained")
     FigureCanvasAgg(figure)
     crowds = [row for row in table if row["world"].startswith("crowd") and row["sides"]]
     panels = figure.subplots(1, 2, sharey=True)
     for axes, along, across, label in (
-        (panels[0], "horizon", "obstacles", "obstacles"),
+        (panels[0], "horizon", "obstacles", "M ="),
         (panels[1], "obstacles", "horizon", "N ="),
     ):
         for i, value in enumerate(sorted({row[across] for row in crowds})):
             part = sorted(
                 (row for row in crowds if row[across] == value), key=lambda row: row[along]
             )
-            name = f"{value} {label}" if across == "obstacles" else f"{label} {value}"
             x = [row[along] for row in part]
             style = {"color": _COLOURS[i], "marker": _MARKERS[i], "linewidth": 2.0}
-            axes.plot(x, [row["median_ms"] for row in part], label=name, **style)
+            axes.plot(x, [row["median_ms"] for row in part], label=f"{label} {value}", **style)
             p99 = [row["p99_ms"] for row in part]
             axes.plot(x, p99, color=_COLOURS[i], linestyle=":", linewidth=1.4)
         axes.axhline(1e3 * DT, color="black", linewidth=1.2, linestyle="--")
@@ -45,14 +44,18 @@ def scaling_figure(table: Sequence[dict[str, Any]], fitted: dict[str, float]) ->
         axes.minorticks_off()
         axes.tick_params(labelsize=12)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=11, frameon=False, loc="upper left")
-    panels[0].annotate(
-        f"sampling time {DT:g} s", (5, 1e3 * DT), xytext=(0, 4), textcoords="offset points"
-    )
+        axes.legend(
+            fontsize=11, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.13)
+        )
+    where = {"xytext": (0, 4), "textcoords": "offset points", "fontsize": 11}
+    panels[0].annotate(f"sampling time {DT:g} s", (5, 1e3 * DT), **where)
     panels[0].set_xlabel("horizon N", fontsize=13)
     panels[1].set_xlabel("obstacles M", fontsize=13)
     panels[0].set_ylabel("time per control step [ms]", fontsize=13)
-    panels[0].set_title(f"one obstacle from N = 30 on: median ~ N^{fitted['a']:.2f}", fontsize=13)
-    panels[1].set_title(f"N = 30: median ~ M^{fitted['b']:.2f}", fontsize=13)
-    figure.suptitle("solid: median, dotted: 99th percentile, all sides tried", fontsize=12)
+    panels[0].set_title(f"side kept, M = 1, N >= 30: median ~ N^{fitted['a']:.2f}", fontsize=13)
+    panels[1].set_title(f"side kept, N = 30: median ~ M^{fitted['b']:.2f}", fontsize=13)
+    figure.suptitle(
+        "Solid: median, dotted: 99th percentile, with the ways past tried at every step",
+        fontsize=12,
+    )
     return figure
