@@ -78,3 +78,10 @@ def test_long_horizon_passes_rather_than_trails():
     assert {plan.status for plan in run.plans} == {Status.CONVERGED}
     assert run.tracking_errors.max() < 5.0
     assert run.tracking_errors[-1] < 0.5
+
+
+def test_a_gust_that_closes_one_way_does_not_cost_safety_while_another_is_open():
+    """Around step 245 the controller's own way is closed; a longer one is not."""
+    run = simulate(SCENARIOS["scenario-4"], steps=255)
+    assert all(plan.ok for plan in run.plans[100:])
+    assert any(plan.switched for plan in run.plans[240:250])

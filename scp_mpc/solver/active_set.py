@@ -106,16 +106,17 @@ class ActiveSetSolver:
         return self._settled(program, np.sign(-force).astype(np.intp), capped, cap)
 
     def glimpse(
-        self, program: CondensedProgram, active: IntArray
+        self, program: CondensedProgram, active: IntArray, cap: float = np.inf
     ) -> tuple[FloatArray, BoolArray] | None:
         """Return only v (nv,) and which half-spaces (K,) push, or None.
 
         Args:
             program: The program.
             active: (nf,) guess of the active bounds.
+            cap: As for `solve`.
         """
         guess = np.concatenate([active, np.zeros(len(program.b), dtype=np.intp)])
-        end = self._search(program, guess, np.inf)
+        end = self._search(program, guess, cap)
         return None if end is None else (end[0], end[1][len(self._F) :] > 0)
 
     def consistent(self, program: CondensedProgram, held: Held, tolerance: float) -> bool:

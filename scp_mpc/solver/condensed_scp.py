@@ -107,12 +107,15 @@ class CondensedSCP:
             bounds = end.active[: len(bounds)]
             touched = conflicts.table(end.active[len(bounds) :] != 0, *near.shape)
 
-    def glimpses(self, best: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
+    def glimpses(
+        self, best: Iterate, paths: Sequence[FloatArray], firm: bool = True
+    ) -> list[Glimpse]:
         """Solve one program about each path (N, d), all linearised at once.
 
         Args:
             best: Whose bounds and sizes to begin with.
             paths: Where to linearise; they need not obey the dynamics.
+            firm: Whether slack is out of the question.
         """
         if not paths:
             return []
@@ -129,9 +132,9 @@ class CondensedSCP:
         with at.watch.solving:
             A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
             b -= (a * at.y_free[conflicts.at]).sum(axis=2)
-        bounds = self._active_bounds(best)
+        bounds, cap = self._active_bounds(best), np.inf if firm else self._problem.slack_weight
         return [
-            self._glimpse(at.program(rows, least), bounds, conflicts, best, path)
+            self._glimpse(at.program(rows, least), bounds, cap, conflicts, best, path)
             for rows, least, path in zip(A, b, paths, strict=True)
         ]
 
@@ -139,13 +142,14 @@ class CondensedSCP:
         self,
         program: CondensedProgram,
         bounds: IntArray,
+        cap: float,
         conflicts: Conflicts,
         best: Iterate,
         path: FloatArray,
     ) -> Glimpse:
         shape = self._at.data.count, len(path)
         with self._at.watch.solving, self._at.watch.inside:
-            end = self._qp.glimpse(program, bounds)
+            end = self._qp.glimpse(program, bounds, cap)
         if end is None:
             nobody = np.zeros(shape, dtype=np.bool_)
             return Glimpse(np.inf, nobody, partial(moved, best, self._position, path))
@@ -153,9 +157,11 @@ class CondensedSCP:
         v, pushing = end
         reached = self._at.path(self._at.y(v))[1:]
         # A plan costs |v|^2 / 2 more than the one that nothing constrains.
-        cost = float(v @ v) / 2
+        merit = float(v @ v) / 2
+        if np.isfinite(cap):
+            merit += cap * float(np.maximum(program.b - program.A @ v, 0.0).sum())
         start = partial(moved, best, self._position, reached)
-        return Glimpse(cost, conflicts.table(pushing, *shape), start)
+        return Glimpse(merit, conflicts.table(pushing, *shape), start)
 
     def _near(self, paths: FloatArray, s: FloatArray, near: BoolArray) -> BoolArray:
         """Pairs in `near` (J, N), or near to one of the paths (C, N+1, d); all if there is none."""

@@ -150,15 +150,19 @@ class SCP:
         here = self._passing(best.iterate, best.iterate.touched[: step.count])
         sides = candidates(step, self._engine.free_path(), here.path, full)
         present = replace(best.iterate, s=full)
-        starts = self._engine.glimpses(present, [side.path for side in sides])
+        safe = best.status.ok
+        starts = self._engine.glimpses(present, [side.path for side in sides], firm=safe)
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=False)  # none if they are too many
         )
         goal, switched = best, False
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
-        for start in ranked[: self.settings.rivals]:
-            if best.status.ok and same_way(step, self._passing(start.iterate, start.touched), here):
+        # A plan with slack is followed by any without: then all ways are worth their time.
+        for start in ranked[: self.settings.rivals] if safe else ranked:
+            if not safe and goal.status.ok:
+                break
+            if safe and same_way(step, self._passing(start.iterate, start.touched), here):
                 continue  # this way leads to where we are
             rival = self._engine.descend(start.iterate, self.settings.max_iterations, goal)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):

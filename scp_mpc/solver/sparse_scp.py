@@ -84,13 +84,15 @@ class SparseSCP:
         """Its positions (N, d)."""
         return self.free().states[1:, self._problem.model.position]
 
-    def glimpses(self, best: Iterate, paths: Sequence[FloatArray]) -> list[Glimpse]:
-        """Solve one program about each path (N, d)."""
+    def glimpses(
+        self, best: Iterate, paths: Sequence[FloatArray], firm: bool = True
+    ) -> list[Glimpse]:
+        """Solve one program about each path (N, d); see `CondensedSCP.glimpses`."""
         position = self._problem.model.position
-        return [self._glimpse(self.descend(moved(best, position, path), 1)) for path in paths]
+        return [self._glimpse(self.descend(moved(best, position, path), 1), firm) for path in paths]
 
-    def _glimpse(self, end: Descent) -> Glimpse:
-        merit = end.merit if end.status.ok else np.inf
+    def _glimpse(self, end: Descent, firm: bool) -> Glimpse:
+        merit = end.merit if end.status.ok or not firm else np.inf
         return Glimpse(merit, end.iterate.touched[: self.step.count], end.make)
 
     def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent:
