@@ -126,10 +126,11 @@ def test_the_same_row_twice_does_no_harm():
 
 def test_bounds_enter_as_they_matter_and_all_are_kept():
     """The half-spaces push against bounds that neither the guess nor the origin touches."""
-    F, p = program(11, n=30, K=8, far=True)
-    held = ActiveSetSolver(F).solve(p, np.zeros(38, dtype=np.intp))
-    assert (held.active[:30] != 0).any()
-    check(F, p, held)
+    for n in (30, 150):
+        F, p = program(11, n=n, K=8, far=True)
+        held = ActiveSetSolver(F).solve(p, np.zeros(n + 8, dtype=np.intp))
+        assert (held.active[:n] != 0).any()
+        check(F, p, held)
 
 
 def test_consistent_sees_wrong_forces_and_broken_constraints():

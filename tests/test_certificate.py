@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 from instances import KINDS, S_REF, instance, obstacle, problem, straight_reference
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status, Trajectory
+from scp_mpc.solver import condensed_scp
+from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.conflicts import Conflicts
 from scp_mpc.solver.step_data import StepData
 
 
@@ -168,3 +171,60 @@ def test_a_program_sent_to_the_rescue_on_purpose_gives_the_same_plan():
         assert set(plan.qps) <= {name, "kkt"}
         assert plan.cost == pytest.approx(plans["daqp"].cost, rel=1e-6)
         np.testing.assert_allclose(plan.X, plans["daqp"].X, atol=2e-3)
+
+
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+def test_pairs_are_linearised_like_the_whole_table(inflation):
+    """Also where p = mu, and only the offset one stage earlier tells the side."""
+    rng = np.random.default_rng(0)
+    case, ref = problem(8, inflation, max_obstacles=3), straight_reference(8)
+    x0 = ref[0] + [0.0, 0.0, 0.3, 0.0]
+    obstacles = [obstacle(8, (1.0, 0.2)), obstacle(8, (2.0, -0.4), (-0.5, 0.1))]
+    condensed = Condensed(case)
+    condensed.start(x0, ref)
+    y = np.concatenate([rng.normal(size=16), np.zeros(16), [S_REF, 2.0, 1.5]])
+    states = ref.copy()
+    states[1:, [0, 2]] += y[condensed.p].reshape(8, 2)
+    states[3, [0, 2]] = obstacles[0].means[3]
+    states[1, [0, 2]] = obstacles[1].means[1]
+    y[condensed.p] = (states - ref)[1:, [0, 2]].ravel()
+    step = StepData.read(case, x0, ref, obstacles)
+    whole = step.half_spaces(states, y[condensed.s])
+    pairs = Conflicts(step, condensed, np.ones((2, 8), dtype=bool))
+    tangent = pairs.tangent(y)
+    at = pairs.obstacle, pairs.stage
+    np.testing.assert_allclose(tangent.g, whole.value[at], atol=1e-12)
+    np.testing.assert_allclose(tangent.a[:, :2], whole.normal[at], atol=1e-9)
+    np.testing.assert_allclose(tangent.a[:, 2], whole.slope[at], atol=1e-9)
+    paths = np.stack([states[:, [0, 2]]] * 2)
+    paths[:, 0] = x0[[0, 2]]
+    a, b = pairs.about(paths, y[condensed.s])
+    np.testing.assert_allclose(a[1], tangent.a, atol=1e-12)
+    residual = (a[1] * y[pairs.at]).sum(axis=1) - b[1]
+    np.testing.assert_allclose(residual, whole.value[at], atol=1e-9)
+
+
+def test_pairs_left_out_come_back_when_the_plan_moves_onto_them(monkeypatch):
+    """With nothing but the guess's own pairs, the plan is pushed into the second obstacle."""
+    monkeypatch.setattr(condensed_scp, "_NEAR", 0.0)
+    case, ref = problem(20, max_obstacles=2), straight_reference(20)
+    both = [obstacle(20, (3.0, 0.15)), obstacle(20, (3.4, -1.4))]
+    solver = SCP(case, Settings(sides=False))
+    monkeypatch.setattr(solver._sparse, "descend", lambda *_: pytest.fail("no need"))
+    plan = solver.solve(ref[0], ref, both, Trajectory(ref, np.zeros((20, 2))))
+    assert plan.status is Status.CONVERGED
+    assert true_values(case, plan, ref[0], ref, both).min() >= -1e-6
+    assert plan.iterate.touched.any(axis=1).all()
+
+
+def test_the_slacks_own_multipliers_balance_their_price():
+    """Where a pair yields: price + force on the pair + multiplier of slack >= 0 is nothing."""
+    case = problem(8)
+    x0, ref = np.array([0.0, 4.0, 0.0, 0.0]), straight_reference(8, 4.0)
+    plan = SCP(case).solve(x0, ref, [obstacle(8, (1.2, 0.05), covariance=np.eye(2))])
+    assert plan.status is Status.SOFTENED
+    assert set(plan.qps) <= {"kkt", "daqp"}
+    balance = case.slack_weight + plan.multipliers.obstacles + plan.multipliers.slack
+    np.testing.assert_allclose(balance, 0.0, atol=1e-6)
+    assert (plan.multipliers.slack <= 1e-9).all()
+    assert (np.abs(plan.multipliers.slack[plan.slack > 1e-6]) < 1e-6).all()
