@@ -97,3 +97,35 @@ def test_the_condensed_and_the_sparse_descent_end_in_plans_of_equal_standing(
     for name in ("obstacles", "inputs", "margin", "dynamics"):
         mine, theirs = getattr(plan.multipliers, name), getattr(slow.multipliers, name)
         np.testing.assert_allclose(mine, theirs, atol=1e-3 * (1 + np.abs(theirs).max()))
+
+
+def unstable(horizon, max_obstacles):
+    A = np.array([[1.6, 0.2], [0.0, 1.5]])
+    model = LinearModel(np.kron(np.eye(2), A), np.kron(np.eye(2), [[0.02], [0.2]]), 0.2, [0, 2])
+    changes = {"Q": [1.0, 0.1] * 2, "R": [0.1, 0.1], "u_min": -50.0, "u_max": 50.0}
+    return problem(horizon, max_obstacles=max_obstacles, model=model, **changes)
+
+
+@pytest.mark.parametrize("horizon", [30, 80])
+@pytest.mark.parametrize("max_obstacles", [0, 1])
+def test_a_plant_too_unstable_to_roll_out_is_left_to_the_sparse_program(horizon, max_obstacles):
+    """At 1.6^30 the roll-out does not certify any more, at 1.6^80 there is no condensed problem."""
+    case = unstable(horizon, max_obstacles)
+    assert (SCP(case)._condensed is None) == (horizon == 80)
+    plan = SCP(case).solve(np.array([0.1, 0.0, 0.1, 0.0]), np.zeros(4))
+    assert set(plan.qps) & {"osqp", "piqp"}
+    assert np.isfinite(plan.u0).all()
+
+
+def test_a_candidates_merit_is_the_cost_of_its_first_program():
+    """Far from the reference, where the plan without constraints is dear already."""
+    case, ref = problem(20), straight_reference(20)
+    x0 = ref[0] + [-1.0, 0.5, 0.4, -0.5]
+    blocking = [obstacle(20, (3.0, 0.1), (0.5, 0.0))]
+    plan = SCP(case).solve(x0, ref, blocking)
+    free = SCP(case).solve(x0, ref)
+    merits = [candidate.merit for candidate in plan.candidates]
+    assert free.cost > 0.5
+    # The best way's first program is a little above where its descent ends; none is below free.
+    assert plan.cost * (1 - 1e-9) <= min(merits) < 1.5 * plan.cost
+    assert min(merits) >= free.cost

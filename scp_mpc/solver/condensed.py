@@ -34,7 +34,7 @@ class Condensed:
 
     Initialisation: factorises the unconstrained problem's KKT matrix.
 
-    Usage: `start` once per control step; `free` and `deviations` then belong to it.
+    Usage: `start` once per control step; `deviations` then belongs to it.
 
     Attributes:
         response: (ny, nv) S.
@@ -61,9 +61,8 @@ class Condensed:
         self.boxed = slice(self.u.start, self.u.stop + self.moving_sizes)
         steps = sparse.kron(sparse.eye(N, k=-1), model.A)
         D = sparse.csc_matrix(sparse.eye(N * model.nx) - steps)
-        self._dynamics = splu(  # its own factor: no fill, no pivoting
-            sparse.csc_matrix(D), permc_spec="NATURAL", diag_pivot_thresh=0.0
-        )
+        # Its own factor: no fill, no pivoting.
+        self._dynamics = splu(D, permc_spec="NATURAL", diag_pivot_thresh=0.0)
         self._kkt = splu(self._kkt_matrix(D))
         self._right = np.zeros(self._kkt.shape[0])
         self._drift = np.zeros((N, model.nx))

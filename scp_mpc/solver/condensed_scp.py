@@ -85,6 +85,8 @@ class CondensedSCP:
             goal: Give up when it is plain that this plan will not be reached.
         """
         at, c, data = self._at, self._condensed, self._at.data
+        if not data.count:  # the free plan was the only one, and it did not hold up
+            return None
         path = nominal.states[:, self._position]
         p = path[1:] - data.x_ref[1:, self._position]
         y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
@@ -156,8 +158,7 @@ class CondensedSCP:
         self._at.finished["daqp"] += 1
         v, pushing = end
         reached = self._at.path(self._at.y(v))[1:]
-        # A plan costs |v|^2 / 2 more than the one that nothing constrains.
-        merit = float(v @ v) / 2
+        merit = self._at.least + float(v @ v) / 2
         if np.isfinite(cap):
             merit += cap * float(np.maximum(program.b - program.A @ v, 0.0).sum())
         start = partial(moved, best, self._position, reached)

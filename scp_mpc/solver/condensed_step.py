@@ -66,6 +66,15 @@ class CondensedStep:
             held = self.solve(self.program(*none), nothing.astype(np.intp), np.inf)
         return (self.y_free, nothing) if held is None else (self.y(held.v), held.force)
 
+    @cached_property
+    def least(self) -> float:
+        """Cost of the plan that nothing constrains: any other costs |v|^2 / 2 more."""
+        c, problem = self.condensed, self.problem
+        u = self.y_free[c.u].reshape(-1, problem.model.nu)
+        states = self.data.x_ref.copy()
+        states[1:] += c.deviations(u)
+        return problem.cost(states, u, self.y_free[c.s], self.data.x_ref)
+
     def y(self, v: FloatArray) -> FloatArray:
         """Outputs (ny,) of a solution v (nv,)."""
         moved: FloatArray = self.y_free + self.condensed.response @ v
@@ -73,11 +82,7 @@ class CondensedStep:
 
     def path(self, y: FloatArray) -> FloatArray:
         """(N+1, d) positions of the robot in y, from now on [m]."""
-        position = self.problem.model.position
-        path = self.data.x_ref[:, position]
-        path[0] = self.data.x0[position]
-        path[1:] += y[self.condensed.p].reshape(-1, len(position))
-        return path
+        return self.data.path(y[self.condensed.p])
 
     def convex(self, conflicts: Conflicts, tangent: Tangent) -> CondensedProgram:
         """The convex subproblem about a tangent."""

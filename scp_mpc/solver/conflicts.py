@@ -27,13 +27,12 @@ class Tangent:
         y: (ny,) the point.
         g: (K,) values there.
         a: (K, w) gradients.
-        positions: (K, 1, d) of the robot, sizes (K,) of the ellipsoids, and the half-spaces.
+        spaces: The half-spaces.
     """
 
     y: FloatArray
     g: FloatArray
     a: FloatArray
-    positions: FloatArray
     spaces: HalfSpaces
 
 
@@ -62,9 +61,6 @@ class Conflicts:
         self._step, self._p = step, condensed.p
         self._sets = NoGoSets.pairs(step.means[j, i + 1], step.covariances[j, i + 1], step.radii[j])
         self._means_before = step.means[j, i]
-        position = step.problem.model.position
-        self._reference = step.x_ref[1:, position]
-        self._now = step.x0[position]
 
     def about(self, paths: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Linearise about several paths (C, N+1, d) at sizes s (M,) at once.
@@ -83,25 +79,19 @@ class Conflicts:
             tiled, positions.reshape(-1, 1, d), sizes, before.reshape(-1, d)
         )
         normal = spaces.normal.reshape(count, K, d)
-        b = spaces.offset.reshape(count, K) - (normal * self._reference[self.stage]).sum(axis=2)
+        reference = self._step.x_ref[self.stage + 1][:, self._step.problem.model.position]
+        b = spaces.offset.reshape(count, K) - (normal * reference).sum(axis=2)
         return np.concatenate([normal, spaces.slope.reshape(count, K, 1)], axis=2), b
-
-    def positions(self, y: FloatArray) -> FloatArray:
-        """(N+1, d) of the robot, from now on [m]."""
-        path = np.empty((len(self._reference) + 1, len(self._now)))
-        path[0] = self._now
-        np.add(self._reference, y[self._p].reshape(self._reference.shape), out=path[1:])
-        return path
 
     def tangent(self, y: FloatArray) -> Tangent:
         """Linearise about y."""
-        path = self.positions(y)
+        path = self._step.path(y[self._p])
         positions, s = path[self.stage + 1][:, None], y[self.at[:, -1]]
         spaces = self._step.problem.no_go.linearise(
             self._sets, positions, s, path[self.stage] - self._means_before
         )
         a = np.concatenate([spaces.normal[:, 0], spaces.slope], axis=1)
-        return Tangent(y, spaces.value[:, 0], a, positions, spaces)
+        return Tangent(y, spaces.value[:, 0], a, spaces)
 
     def bend(self, tangent: Tangent) -> FloatArray:
         """Factor L (K, w, d-1) of the second derivatives at the tangent's point."""

@@ -106,6 +106,14 @@ class StepData:
         start[: self.count] = self.x0[self.problem.model.position] - self.means[:, 0]
         return start
 
+    def path(self, deviations: FloatArray) -> FloatArray:
+        """Positions (N+1, d) [m] from now on, given their deviations (N d,) from the reference."""
+        position = self.problem.model.position
+        path = self.x_ref[:, position]
+        path[0] = self.x0[position]
+        path[1:] += deviations.reshape(-1, len(position))
+        return path
+
     def half_spaces(self, states: FloatArray, s: FloatArray) -> HalfSpaces:
         """Linearise the obstacles' constraints about states (N+1, nx) and sizes s (M,)."""
         positions = states[1:, self.problem.model.position]
