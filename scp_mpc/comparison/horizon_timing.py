@@ -4,7 +4,7 @@ For N = 8 and N = 30 (scenarios 2 and 1), and where asked for 5 and 12 obstacles
 is recorded once. Every solver then solves its steps from the same guess, twenty in a row as in a
 control loop, in turns of shuffled order, so that the machine's noise hits all alike:
 
-    scp_mpc                 from the guess, on the side of the guess: like for like
+    scp_mpc                 from the guess alone: like for like
     scp_mpc (both sides)    default settings, trying the other sides at every step
     scp_mpc (osqp)          sparse programs, OSQP first and PIQP for what it does not finish
     scp_mpc (osqp alone)    the same without PIQP
