@@ -19,8 +19,9 @@ from scp_mpc.obstacles import (
     ObstaclePrediction,
     ReportPredictor,
 )
-from scp_mpc.problem import Margin, Problem
+from scp_mpc.problem import Problem
 from scp_mpc.robots import DoubleIntegrator, LinearModel
+from scp_mpc.safety import Containment, JointRisk, Margin, StageRisk
 from scp_mpc.settings import QPSettings, Settings
 from scp_mpc.solver import SCP, Iterate, Plan, Status
 from scp_mpc.trajectory import Trajectory
@@ -35,10 +36,12 @@ __all__ = [
     "CircularReference",
     "ConcurrentUseError",
     "ConstantVelocityPredictor",
+    "Containment",
     "CovarianceError",
     "DoubleIntegrator",
     "InvalidArgumentError",
     "Iterate",
+    "JointRisk",
     "LinearModel",
     "Margin",
     "NotFiniteError",
@@ -50,6 +53,7 @@ __all__ = [
     "ScpMpcError",
     "Settings",
     "ShapeError",
+    "StageRisk",
     "Status",
     "TooManyObstaclesError",
     "Trajectory",

@@ -4,6 +4,7 @@
     over       x_1..x_N, u_0..u_{N-1}, s_j
     subject to x_{i+1} = f(x_i, u_i),  x_0 given
                p_i outside the no-go set of obstacle j at stage i, sized by s_j
+               (likewise at points within the interval before i, where the robot is fast)
                s_min <= s_j <= s_max,  u_min <= u_i <= u_max
 
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given.
@@ -20,40 +21,10 @@ from scp_mpc.arrays import FloatArray, as_array, as_count, as_number, as_weight,
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
+from scp_mpc.safety.margin import Containment, Margin, Promise, size_at
 from scp_mpc.settings import require_positive
 
-CHI_SQUARE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom
-
 _INFLATIONS: dict[str, type[Inflation]] = {"exact": ExactInflation, "axes": AxesInflation}
-
-
-@dataclass(frozen=True)
-class Margin:
-    """The size s of an obstacle's ellipsoid, in standard deviations, as a decision variable.
-
-    Attributes:
-        reference: s_ref; the default contains 95 % of a planar Gaussian.
-        lower: s_min.
-        upper: s_max.
-        weight: w of the cost w (s - s_ref)^2.
-    """
-
-    reference: float = CHI_SQUARE_95**0.5
-    lower: float = CHI_SQUARE_95**0.5
-    upper: float = 10.0
-    weight: float = 0.005
-
-    def __post_init__(self) -> None:
-        """Check the order 0 <= lower <= reference <= upper and the weight."""
-        for name in ("reference", "lower", "upper", "weight"):
-            as_number(f"margin.{name}", getattr(self, name))
-        if not 0 <= self.lower <= self.upper:
-            raise BoundsError("margin.lower", f"not 0 <= {self.lower} <= upper = {self.upper}")
-        if not self.lower <= self.reference <= self.upper:
-            raise BoundsError(
-                "margin.reference", f"{self.reference} is outside [{self.lower}, {self.upper}]"
-            )
-        require_positive("margin.weight", self.weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +40,14 @@ class Problem:
         u_max: Upper input bounds, a number or (nu,).
         Qf: Weight of the last state; Q if None.
         robot_radius: Radius of the robot [m].
-        margin: The obstacles' sizes s_j.
+        margin: The obstacles' sizes s_j: a `Margin` that may give way, or a promise that does not,
+            `StageRisk`, `JointRisk` or `Containment`. None: 95 % containment, in the plane as the
+            report's `Margin`.
         inflation: "exact" for ellipsoid (+) ball, "axes" for the report's lengthened axes.
         max_obstacles: Number of obstacle slots M in the program.
+        subsamples: Points in each interval at which the obstacles are constrained where the robot's
+            way in one interval exceeds the radii; there the radii grow by as much as is needed for
+            nothing to pass between two points. 1: the samples as they are, as in the report.
         slack_weight: Cost per metre of slack and stage where the constraints cannot all be met.
             The penalty is exact as long as it exceeds the obstacles' multipliers.
 
@@ -87,9 +63,10 @@ class Problem:
     u_max: FloatArray
     Qf: FloatArray
     robot_radius: float
-    margin: Margin
+    margin: Promise
     inflation: Literal["exact", "axes"]
     max_obstacles: int
+    subsamples: int
     slack_weight: float
 
     def __init__(
@@ -103,9 +80,10 @@ class Problem:
         u_max: ArrayLike,
         Qf: ArrayLike | None = None,
         robot_radius: float = 0.0,
-        margin: Margin | None = None,
+        margin: Promise | None = None,
         inflation: Literal["exact", "axes"] = "exact",
         max_obstacles: int = 1,
+        subsamples: int = 4,
         slack_weight: float = 1e3,
     ) -> None:
         """Copy, check and freeze."""
@@ -122,9 +100,11 @@ class Problem:
             )
         max_obstacles = as_count("max_obstacles", max_obstacles, least=0)
         require_positive("slack_weight", slack_weight)
-        margin = Margin() if margin is None else margin
-        if not isinstance(margin, Margin):
-            raise InvalidArgumentError("margin", f"{margin!r} is not a Margin")
+        subsamples = as_count("subsamples", subsamples)
+        if margin is None:
+            margin = Margin() if model.dim == 2 else Containment(0.95)
+        if not isinstance(margin, Promise):
+            raise InvalidArgumentError("margin", f"{margin!r} is no Margin, risk or Containment")
         values = {
             "model": model,
             "horizon": horizon,
@@ -137,6 +117,7 @@ class Problem:
             "margin": margin,
             "inflation": inflation,
             "max_obstacles": max_obstacles,
+            "subsamples": subsamples,
             "slack_weight": float(slack_weight),
         }
         for name, value in values.items():
@@ -145,7 +126,18 @@ class Problem:
     @cached_property
     def no_go(self) -> Inflation:
         """The inflation's geometry."""
-        return _INFLATIONS[self.inflation](self.margin.reference)
+        return _INFLATIONS[self.inflation](self.size.reference)
+
+    @cached_property
+    def size(self) -> Margin:
+        """The margin in standard deviations; that of a promise is fixed, for all slots in use."""
+        if isinstance(self.margin, Margin):
+            return self.margin
+        return Margin.fixed(self.size_for(self.max_obstacles, 1))
+
+    def size_for(self, obstacles: int, count: int) -> float:
+        """The uniform size s for so many obstacles, with `count` points in each interval."""
+        return size_at(self.margin, self.model.dim, obstacles, self.horizon, count)
 
     def cost(
         self, states: FloatArray, inputs: FloatArray, s: FloatArray, x_ref: FloatArray
@@ -154,8 +146,8 @@ class Problem:
         error = states[1:] - x_ref[1:]
         track = np.vdot(error[:-1] @ self.Q, error[:-1]) + error[-1] @ self.Qf @ error[-1]
         effort = np.vdot(inputs @ self.R, inputs)
-        deviation = s - self.margin.reference
-        return float(track + effort + self.margin.weight * (deviation @ deviation))
+        deviation = s - self.size.reference
+        return float(track + effort + self.size.weight * (deviation @ deviation))
 
 
 def _bounds(u_min: ArrayLike, u_max: ArrayLike, nu: int) -> tuple[FloatArray, FloatArray]:

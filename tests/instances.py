@@ -30,7 +30,7 @@ def problem(
     max_obstacles: int = 1,
     **changes: object,
 ) -> Problem:
-    """Return the report's problem with the given changes."""
+    """Return the report's problem, constrained at the samples only, with the given changes."""
     values: dict = {
         "model": DoubleIntegrator(DT),
         "horizon": horizon,
@@ -42,6 +42,7 @@ def problem(
         "margin": Margin(lower=s_min),
         "inflation": inflation,
         "max_obstacles": max_obstacles,
+        "subsamples": 1,
     }
     return Problem(**{**values, **changes})
 

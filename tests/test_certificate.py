@@ -53,10 +53,10 @@ def residuals(case, plan):
 def test_equals_an_independent_computation(monkeypatch, kind, s_min, limit):
     case = instance(kind, 12, "axes", s_min, 1)
     solver = SCP(case.problem, Settings(sides=False, max_iterations=limit))
-    monkeypatch.setattr(solver._sparse, "descend", lambda *_: pytest.skip("taken over"))
-    best = solver._engine
+    engine = solver._resolution.coarse
     guess = Trajectory(case.x_ref, np.zeros((12, 2)))
-    monkeypatch.setattr(solver, "_descend", lambda *given: best.descend(given[-1], limit))
+    monkeypatch.setattr(engine, "descend", lambda start: engine.primary.descend(start, limit))
+    monkeypatch.setattr(solver, "_rescue", lambda *given: given[-1])
     plan = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
     stationarity, feasibility, product = residuals(case, plan)
     assert plan.kkt.stationarity == pytest.approx(stationarity, rel=1e-6, abs=1e-10)
@@ -192,7 +192,7 @@ def test_pairs_are_linearised_like_the_whole_table(inflation):
     whole = step.half_spaces(states, y[condensed.s])
     pairs = Conflicts(step, condensed, np.ones((2, 8), dtype=bool))
     tangent = pairs.tangent(y)
-    at = pairs.obstacle, pairs.stage
+    at = pairs.obstacle, pairs.point
     np.testing.assert_allclose(tangent.g, whole.value[at], atol=1e-12)
     np.testing.assert_allclose(tangent.a[:, :2], whole.normal[at], atol=1e-9)
     np.testing.assert_allclose(tangent.a[:, 2], whole.slope[at], atol=1e-9)
@@ -210,7 +210,9 @@ def test_pairs_left_out_come_back_when_the_plan_moves_onto_them(monkeypatch):
     case, ref = problem(20, max_obstacles=2), straight_reference(20)
     both = [obstacle(20, (3.0, 0.15)), obstacle(20, (3.4, -1.4))]
     solver = SCP(case, Settings(sides=False))
-    monkeypatch.setattr(solver._sparse, "descend", lambda *_: pytest.fail("no need"))
+    monkeypatch.setattr(
+        solver._resolution.coarse.sparse, "descend", lambda *_: pytest.fail("no need")
+    )
     plan = solver.solve(ref[0], ref, both, Trajectory(ref, np.zeros((20, 2))))
     assert plan.status is Status.CONVERGED
     assert true_values(case, plan, ref[0], ref, both).min() >= -1e-6

@@ -73,7 +73,7 @@ def easy(inflation="exact", dim=2, horizon=6, **changes):
         robot_radius=0.15,
         inflation=inflation,
         max_obstacles=2,
-        **changes,
+        **{"subsamples": 1, **changes},
     )
     x_ref = np.zeros((horizon + 1, 2 * dim))
     x_ref[:, 0], x_ref[:, 1] = 0.4 * np.arange(horizon + 1), 2.0

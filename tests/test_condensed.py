@@ -73,7 +73,7 @@ def test_without_an_input_weight_there_may_be_no_condensed_problem():
     idle = LinearModel(model.A, B, 0.2, model.position)
     case = problem(8, model=idle, R=[0.001, 0.001, 0.0])
     solver = SCP(case)
-    assert solver._condensed is None
+    assert not solver._resolution.coarse.condenses
     plan = solver.solve(np.zeros(4), straight_reference(8), [obstacle(8, (1.5, 0.1))])
     assert plan.ok
 
@@ -111,7 +111,7 @@ def unstable(horizon, max_obstacles):
 def test_a_plant_too_unstable_to_roll_out_is_left_to_the_sparse_program(horizon, max_obstacles):
     """At 1.6^30 the roll-out does not certify any more, at 1.6^80 there is no condensed problem."""
     case = unstable(horizon, max_obstacles)
-    assert (SCP(case)._condensed is None) == (horizon == 80)
+    assert SCP(case)._resolution.coarse.condenses == (horizon == 30)
     plan = SCP(case).solve(np.array([0.1, 0.0, 0.1, 0.0]), np.zeros(4))
     assert set(plan.qps) & {"osqp", "piqp"}
     assert np.isfinite(plan.u0).all()

@@ -142,8 +142,8 @@ def test_convergence_is_quadratic_at_the_end():
         solver = SCP(case.problem, exact(limit))
         # The condensed engine alone: the sparse one would take over where this one runs out.
         step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
-        solver._engine.begin(step, Stopwatch())
-        end = solver._engine.descend(replace(plan.iterate, states=X), limit)
+        solver._resolution.coarse.primary.begin(step, Stopwatch())
+        end = solver._resolution.coarse.primary.descend(replace(plan.iterate, states=X), limit)
         residuals.append(end.residuals.worst)
     assert residuals[1] < 20 * residuals[0] ** 1.7
     assert residuals[2] < 1e-9

@@ -183,21 +183,44 @@ def test_running_out_of_iterations_is_said_so():
     assert plan.kkt.worst > 1e-6
 
 
-def test_without_any_solution_the_guess_is_kept_within_limits():
+DEAD = Settings(condense=False, qp=QPSettings(max_iterations=1, check_interval=1, rescue=False))
+
+
+def test_without_any_solution_the_robot_brakes_within_limits():
+    """Too fast to stop in time: that is said, with the true violation."""
     case = instance("ahead", 8, "exact", S_REF, 0)
-    dead = Settings(condense=False, qp=QPSettings(max_iterations=1, check_interval=1, rescue=False))
+    x0 = case.x0 + [0.0, 3.0, 0.0, 0.0]
     guess = Trajectory(case.x_ref, np.tile([7.0, 0.0], (8, 1)))
-    plan = SCP(case.problem, dead).solve(case.x0, case.x_ref, case.obstacles, guess)
+    plan = SCP(case.problem, DEAD).solve(x0, case.x_ref, case.obstacles, guess)
     assert plan.status is Status.FALLBACK
     assert not plan.ok
-    np.testing.assert_array_equal(plan.U, np.tile([3.0, 0.0], (8, 1)))
-    np.testing.assert_array_equal(plan.X[0], case.x0)
-    assert plan.kkt == KKTResiduals(np.inf, np.inf, np.inf)
-    step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
+    # Straight ahead, at the limit of the first axis; the second one's share keeps the direction.
+    np.testing.assert_allclose(plan.u0, -3.0 * x0[[1, 3]] / x0[1])
+    np.testing.assert_array_equal(plan.X[0], x0)
+    assert plan.kkt.stationarity == np.inf
+    assert plan.kkt.feasibility == plan.slack.max()
+    step = StepData.read(case.problem, x0, case.x_ref, case.obstacles)
     value = step.half_spaces(plan.X, np.array([S_REF])).value
     assert value.min() < -0.01
     np.testing.assert_allclose(plan.slack, np.maximum(0.0, -value), atol=1e-12)
     assert plan.multipliers is None
+
+
+def test_without_any_solution_a_guess_that_is_clear_is_kept_else_braking():
+    case = instance("ahead", 8, "exact", S_REF, 0)
+    solver = SCP(case.problem, DEAD)
+    aside = Trajectory(case.x_ref, np.tile([-2.0, 1.0], (8, 1)))
+    kept = solver.solve(case.x0, case.x_ref, case.obstacles, aside)
+    assert kept.status is Status.PREVIOUS
+    assert kept.ok
+    np.testing.assert_array_equal(kept.U, aside.inputs)
+    onto = Trajectory(case.x_ref, np.tile([3.0, 0.0], (8, 1)))
+    braking = solver.solve(case.x0, case.x_ref, case.obstacles, onto)
+    assert braking.status is Status.BRAKING
+    assert braking.ok
+    speed = np.linalg.norm(braking.X[:, [1, 3]], axis=1)
+    assert (np.diff(speed) <= 1e-12).all()
+    assert speed[-1] == pytest.approx(0.0, abs=1e-12)
 
 
 def far_side():
@@ -262,13 +285,13 @@ def test_a_rival_that_breaks_down_does_not_lose_the_plan(monkeypatch):
     case, ref, slow, guess = far_side()
     kept = SCP(case, KEEP_SIDE).solve(ref[0], ref, slow, guess)
     broken = SCP(case)
-    descend, calls = broken._engine.descend, []
+    descend, calls = broken._resolution.coarse.primary.descend, []
 
     def breaking(nominal, limit, goal=None):
         calls.append(goal)
         return descend(nominal, limit, goal) if goal is None else None
 
-    monkeypatch.setattr(broken._engine, "descend", breaking)
+    monkeypatch.setattr(broken._resolution.coarse.primary, "descend", breaking)
     plan = broken.solve(ref[0], ref, slow, guess)
     assert len(calls) == 2
     assert not plan.switched

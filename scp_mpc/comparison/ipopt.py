@@ -144,7 +144,7 @@ def import_casadi() -> Any:
 def parameters(step: StepData) -> FloatArray:
     """All that changes from step to step, in a row: x0, x_ref, mu, R, sigma, r."""
     sets = step.sets
-    data = (step.x0, step.x_ref[1:], sets.means, sets.rotations, sets.deviations, sets.radii)
+    data = (step.x0, step.x_ref[1:], sets.means, sets.rotations, sets.deviations, sets.radii[:, 0])
     return np.concatenate([part.ravel() for part in data])
 
 
@@ -165,7 +165,7 @@ def _program(casadi: Any, problem: Problem, unknowns: Unknowns, lifted: bool) ->
     X, U = casadi.reshape(later, nx, N), casadi.reshape(inputs, nu, N)
     defects = X - model.A @ casadi.horzcat(x0, X[:, :-1]) - model.B @ U
     error = X - x_ref
-    cost = problem.margin.weight * casadi.sumsqr(s - problem.margin.reference)
+    cost = problem.size.weight * casadi.sumsqr(s - problem.size.reference)
     for i in range(N):
         Q = problem.Q if i < N - 1 else problem.Qf
         cost += casadi.bilin(Q, error[:, i], error[:, i])

@@ -14,6 +14,7 @@ which each peer writes in the way that suits it.
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
 from scp_mpc.solver.iterate import Iterate
 
@@ -28,15 +29,22 @@ class Unknowns:
         size: Length of z.
         lower: (size,) lower bounds, minus infinity for states.
         upper: (size,) upper bounds, infinity for states.
+
+    Raises:
+        InvalidArgumentError: The problem constrains points between the samples.
     """
 
     def __init__(self, problem: Problem) -> None:
         """Lay out z and its bounds."""
+        if problem.subsamples > 1:
+            raise InvalidArgumentError(
+                "problem.subsamples", f"{problem.subsamples}, but peers constrain the samples only"
+            )
         N, nx, nu = problem.horizon, problem.model.nx, problem.model.nu
         self._shapes = (N, nx), (N, nu)
         self.ends = N * nx, N * (nx + nu)
         free, sizes = np.full(N * nx, np.inf), np.ones(problem.max_obstacles)
-        margin = problem.margin
+        margin = problem.size
         self.lower = np.concatenate([-free, np.tile(problem.u_min, N), margin.lower * sizes])
         self.upper = np.concatenate([free, np.tile(problem.u_max, N), margin.upper * sizes])
         self.size = len(self.lower)

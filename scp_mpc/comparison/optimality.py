@@ -14,7 +14,7 @@ from scp_mpc.comparison.attempts import TOLERATED
 from scp_mpc.comparison.ipopt import Ipopt
 from scp_mpc.comparison.progress import progress
 from scp_mpc.control.mpc import MPC
-from scp_mpc.problem import Margin
+from scp_mpc.safety.margin import Margin
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 from scp_mpc.solver.scp import SCP
 from scp_mpc.trajectory import Trajectory
@@ -70,7 +70,7 @@ def measure(
     return {
         "scenario": scenario.name,
         "horizon": scenario.horizon,
-        "s_min": problem.margin.lower,
+        "s_min": problem.size.lower,
         "steps": steps,
         "cost": total,
         "active": len(gaps),

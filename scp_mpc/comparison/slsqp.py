@@ -95,5 +95,5 @@ class Slsqp:
         if self.problem.inflation == "exact":
             return step.half_spaces(X, s).value[: step.count].ravel()
         y = sets.to_eigenframe(X[1:, self.problem.model.position] - sets.means)
-        w = y / (s[:, None, None] * sets.deviations + sets.radii[:, None, None])
+        w = y / (s[:, None, None] * sets.deviations + sets.radii[..., None])
         return (np.square(w).sum(axis=-1) - 1)[: step.count].ravel()

@@ -141,7 +141,7 @@ def _program(casadi: Any, problem: Problem) -> tuple[dict[str, Any], list[bool]]
     stages = [casadi.SX.sym(f"xi{i}", nx + M) for i in range(N + 1)]
     inputs = [casadi.SX.sym(f"u{i}", nu) for i in range(N)]
     w, g, equality = [], [], []
-    cost = problem.margin.weight * casadi.sumsqr(stages[0][nx:] - problem.margin.reference)
+    cost = problem.size.weight * casadi.sumsqr(stages[0][nx:] - problem.size.reference)
     for i, xi in enumerate(stages):
         w.append(xi)
         if i < N:
@@ -168,7 +168,7 @@ def _program(casadi: Any, problem: Problem) -> tuple[dict[str, Any], list[bool]]
 
 
 def _bounds(problem: Problem, equality: Any) -> dict[str, FloatArray]:
-    N, margin, M = problem.horizon, problem.margin, problem.max_obstacles
+    N, margin, M = problem.horizon, problem.size, problem.max_obstacles
     free = np.full(problem.model.nx, np.inf)
     low = np.concatenate([-free, np.full(M, margin.lower)])
     high = np.concatenate([free, np.full(M, margin.upper)])

@@ -32,7 +32,7 @@ def largest_violation(
         inputs: (N, nu).
         s: (M,) sizes of the obstacles' ellipsoids.
     """
-    model, margin = problem.model, problem.margin
+    model, margin = problem.model, problem.size
     reached = np.array([model.step(x, u) for x, u in zip(states[:-1], inputs, strict=True)])
     amounts = [
         np.abs(states[0] - x0),

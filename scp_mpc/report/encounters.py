@@ -67,6 +67,6 @@ def spans_of(marked: BoolArray) -> list[tuple[int, int]]:
 
 def _reaches(run: ClosedLoop) -> FloatArray:
     """Longest semi-axis (K,) of the no-go sets [m]."""
-    s_ref, radius = run.problem.margin.reference, run.problem.robot_radius
+    s_ref, radius = run.problem.size.reference, run.problem.robot_radius
     sets = [NoGoSets.now([prediction], radius) for prediction in run.predictions]
-    return np.array([s_ref * o.deviations.max() + o.radii[0] for o in sets])
+    return np.array([s_ref * o.deviations.max() + o.radii[0, 0] for o in sets])

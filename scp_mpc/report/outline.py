@@ -40,7 +40,7 @@ def no_go_outline(
         )
     at = max(stage - 1, 0)
     mean, rotation, sigma = sets.means[0, at], sets.rotations[0, at], sets.deviations[0, at]
-    r = sets.radii[0]
+    r = sets.radii[0, at]
     angle = np.linspace(0.0, 2 * np.pi, _POINTS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if problem.inflation == "axes":

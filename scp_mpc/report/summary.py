@@ -67,7 +67,7 @@ def summarise_all(runs: Sequence[ClosedLoop]) -> dict[str, Any]:
         "settings": asdict(first.settings),
         "seed": first.seed,
         "inflation": first.problem.inflation,
-        "margin": asdict(first.problem.margin),
+        "margin": asdict(first.problem.size),
         "provenance": provenance(),
     }
 

@@ -32,7 +32,7 @@ _LEAST_SPAN = 0.05  # [standard deviations] around s_ref; s itself is known to a
 
 def size_figure(run: ClosedLoop) -> Figure:
     """Draw s between its bounds, and the slack where keeping to them was not possible."""
-    times, margin = run.times[:-1], run.problem.margin
+    times, margin = run.times[:-1], run.problem.size
     figure, (size, violation) = _panels(run, "size s of the no-go set, and slack")
     s = [float(plan.s[0]) for plan in run.plans]
     size.axhline(margin.reference, color=REFERENCE, linewidth=5, label=r"$s_\mathrm{ref}$")

@@ -7,8 +7,11 @@ Notation:
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+from scipy.linalg import fractional_matrix_power
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_number, frozen
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
@@ -77,3 +80,39 @@ class LinearModel:
     def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state A x + B u."""
         return self.A @ x + self.B @ u
+
+    def between(self, fraction: float) -> tuple[FloatArray, FloatArray]:
+        """Return C (d, nx) and D (d, nu): the position C x + D u within an interval.
+
+        For an input held over the interval, [[A, B], [0, I]] ^ fraction advances state and input
+        by that part of it. Where that power is not real, as for a purely discrete model, the
+        position is interpolated between both ends.
+
+        Args:
+            fraction: Of the interval, between 0 and 1.
+        """
+        nx, size = self.nx, self.nx + self.nu
+        whole = np.eye(size)
+        whole[:nx, :nx], whole[:nx, nx:] = self.A, self.B
+        part: Any = np.asarray(fractional_matrix_power(whole, fraction))
+        rest = np.asarray(fractional_matrix_power(whole, 1 - fraction))
+        away = np.abs(rest @ part - whole).max()
+        if np.iscomplexobj(part) or not away <= 1e-9 * np.abs(whole).max():
+            part = (1 - fraction) * np.eye(size) + fraction * whole
+        rows = np.ascontiguousarray(part[self.position].real)
+        return rows[:, :nx], rows[:, nx:]
+
+    def brake(self, x: FloatArray) -> FloatArray:
+        """Return the input (nu,), bounds aside, after which the position comes to rest.
+
+        Without further input the next position but one would differ from the next by
+        P (A - I) (A x + B u); least squares make that vanish.
+        """
+        halt: FloatArray = -self._braking @ x
+        return halt
+
+    @cached_property
+    def _braking(self) -> FloatArray:
+        drift = (self.A - np.eye(self.nx))[self.position]
+        gain: FloatArray = np.linalg.pinv(drift @ self.B) @ drift @ self.A
+        return gain

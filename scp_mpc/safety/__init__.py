@@ -1,15 +1,25 @@
-"""Safety: no-go sets, signed distances and half-spaces; knows no optimisation."""
+"""Safety: no-go sets, signed distances, half-spaces and risk; knows no optimisation."""
 
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
+from scp_mpc.safety.margin import Containment, JointRisk, Margin, Promise, StageRisk
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.risk import containment_size, risk_bound, size_at_risk
 
 __all__ = [
     "AxesInflation",
+    "Containment",
     "ExactInflation",
     "HalfSpaces",
     "Inflation",
+    "JointRisk",
+    "Margin",
     "NoGoSets",
+    "Promise",
+    "StageRisk",
+    "containment_size",
+    "risk_bound",
     "signed_distance",
+    "size_at_risk",
 ]

@@ -85,9 +85,8 @@ class ExactInflation(Inflation):
         across = sets.deviations * n
         slope = -np.sqrt(np.add.reduce(across * across, axis=-1))
         normal = sets.to_world(n)
-        radii = sets.radii[:, None]
-        offset = np.add.reduce(normal * sets.means, axis=-1) + radii
-        return _masked(sets, normal, slope, offset, sd - radii)
+        offset = np.add.reduce(normal * sets.means, axis=-1) + sets.radii
+        return _masked(sets, normal, slope, offset, sd - sets.radii)
 
     def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class.
@@ -99,7 +98,7 @@ class ExactInflation(Inflation):
         half_width = np.maximum(-spaces.slope, _POINT)[..., None]  # sqrt(n' Sigma n)
         pull = sets.deviations**2 * n / half_width  # dh_n/ds
         T = tangents(n)
-        sd = spaces.value + sets.radii[:, None]
+        sd = spaces.value + sets.radii
         pulled = (pull[..., None, :] @ T)[..., 0, :]
         wide = sets.deviations[..., None] * T
         stiffness = np.swapaxes(wide, -2, -1) @ wide - pulled[..., :, None] * pulled[..., None, :]
@@ -112,7 +111,7 @@ class ExactInflation(Inflation):
         """See the base class."""
         y = sets.to_eigenframe(positions - sets.means)
         sd, _ = signed_distance(y, self._reference * sets.deviations)
-        return np.where(sets.active[:, None], sd - sets.radii[:, None], np.inf)
+        return np.where(sets.active[:, None], sd - sets.radii, np.inf)
 
 
 class AxesInflation(Inflation):
@@ -132,7 +131,7 @@ class AxesInflation(Inflation):
         """See the base class."""
         offsets = positions - sets.means
         y = sets.to_eigenframe(offsets)
-        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
+        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[..., None], _POINT)
         scale = self._scale(sets)
         w = y / e
         at_centre = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True) < 1e-12
@@ -149,7 +148,7 @@ class AxesInflation(Inflation):
 
     def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class; the change of w with s alone is left out: g is not convex in it."""
-        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[:, None, None], _POINT)
+        e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[..., None], _POINT)
         scale = self._scale(sets)[..., None]
         norm = np.maximum(spaces.value[..., None] / scale + 1, 1e-12)
         direction = e * sets.to_eigenframe(spaces.normal)
@@ -162,12 +161,12 @@ class AxesInflation(Inflation):
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """See the base class."""
         y = sets.to_eigenframe(positions - sets.means)
-        e = self._reference * sets.deviations + sets.radii[:, None, None]
+        e = self._reference * sets.deviations + sets.radii[..., None]
         sd, _ = signed_distance(y, e)
         return np.where(sets.active[:, None], sd, np.inf)
 
     def _scale(self, sets: NoGoSets) -> FloatArray:
-        shortest = self._reference * sets.deviations.min(axis=-1) + sets.radii[:, None]
+        shortest = self._reference * sets.deviations.min(axis=-1) + sets.radii
         return np.maximum(shortest, _POINT)
 
 

@@ -5,7 +5,7 @@ Notation:
     mu      (M, N, d)       means at stages 1 .. N [m]
     R       (M, N, d, d)    eigenvectors of Sigma in columns
     sigma   (M, N, d)       square roots of Sigma's eigenvalues: standard deviations [m]
-    r       (M,)            robot radius + obstacle radius [m]
+    r       (M, N)          robot radius + obstacle radius, or more [m]
 """
 
 from collections.abc import Sequence
@@ -61,7 +61,24 @@ class NoGoSets:
         variances, rotations = np.linalg.eigh(covariances)
         deviations = np.sqrt(np.maximum(variances, 0.0))
         on = np.ones(len(means), dtype=np.bool_)
-        return cls(means[:, None], rotations[:, None], deviations[:, None], radii, on)
+        return cls(means[:, None], rotations[:, None], deviations[:, None], radii[:, None], on)
+
+    @classmethod
+    def stacked(
+        cls, means: FloatArray, covariances: FloatArray, radii: FloatArray, slots: int
+    ) -> "NoGoSets":
+        """Fill the first J slots with means (J, N, d), covariances (J, N, d, d), radii (J, N)."""
+        count, stages, dim = means.shape
+        mu = np.zeros((slots, stages, dim))
+        rotations = np.zeros((slots, stages, dim, dim))
+        rotations[count:] = np.eye(dim)
+        deviations = np.ones((slots, stages, dim))
+        reach = np.zeros((slots, stages))
+        if count:
+            variances, rotations[:count] = np.linalg.eigh(covariances)
+            deviations[:count] = np.sqrt(np.maximum(variances, 0.0))
+            mu[:count], reach[:count] = means, radii
+        return cls(mu, rotations, deviations, reach, np.arange(slots) < count)
 
     @classmethod
     def _stacked(
@@ -74,19 +91,10 @@ class NoGoSets:
         dim: int,
     ) -> "NoGoSets":
         count = len(predictions)
-        means = np.zeros((slots, horizon, dim))
-        rotations = np.zeros((slots, horizon, dim, dim))
-        rotations[count:] = np.eye(dim)
-        deviations = np.ones((slots, horizon, dim))
-        radii = np.zeros(slots)
-        if count:
-            variances, rotations[:count] = np.linalg.eigh(
-                np.stack([o.covariances[rows] for o in predictions])
-            )
-            deviations[:count] = np.sqrt(np.maximum(variances, 0.0))
-            means[:count] = np.stack([o.means[rows] for o in predictions])
-            radii[:count] = robot_radius + np.array([o.radius for o in predictions])
-        return cls(means, rotations, deviations, radii, np.arange(slots) < count)
+        means = np.array([o.means[rows] for o in predictions]).reshape(count, horizon, dim)
+        covariances = np.array([o.covariances[rows] for o in predictions])
+        radii = robot_radius + np.array([o.radius for o in predictions])
+        return cls.stacked(means, covariances, np.tile(radii[:, None], horizon), slots)
 
     def taken(self, slots: IntArray) -> "NoGoSets":
         """The given slots, in that order."""

@@ -9,7 +9,8 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.problem import Margin, Problem
+from scp_mpc.problem import Problem
+from scp_mpc.safety.margin import Promise
 from scp_mpc.simulation.scenarios import DT, Scenario
 
 _TRACKS = (8.0, 6.6, 9.4, 5.2, 10.8)  # [m] on the reference circle, inside it, outside it
@@ -49,10 +50,13 @@ class Crowd:
         ]
 
     def problem(
-        self, inflation: Literal["exact", "axes"] = "exact", margin: Margin | None = None
+        self,
+        inflation: Literal["exact", "axes"] = "exact",
+        margin: Promise | None = None,
+        subsamples: int = 1,
     ) -> Problem:
         """The report's problem with room for all obstacles."""
-        single = Scenario(self.name, self.name, self.horizon).problem(inflation, margin)
+        single = Scenario(self.name, self.name, self.horizon).problem(inflation, margin, subsamples)
         values = vars(single) | {"max_obstacles": self.count}
         return Problem(**{name: values[name] for name in Problem.__dataclass_fields__})
 

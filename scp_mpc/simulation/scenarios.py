@@ -10,8 +10,9 @@ from scp_mpc.control.reference import CircularReference
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import Predictor, ReportPredictor
-from scp_mpc.problem import Margin, Problem
+from scp_mpc.problem import Problem
 from scp_mpc.robots.double_integrator import DoubleIntegrator
+from scp_mpc.safety.margin import Promise
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance
 
 DT = 0.2  # [s]
@@ -41,9 +42,12 @@ class Scenario:
     reference: CircularReference = field(default_factory=CircularReference)
 
     def problem(
-        self, inflation: Literal["exact", "axes"] = "axes", margin: Margin | None = None
+        self,
+        inflation: Literal["exact", "axes"] = "axes",
+        margin: Promise | None = None,
+        subsamples: int = 1,
     ) -> Problem:
-        """The report's problem (III.A, III.E); its margin has s_min = s_ref, as printed."""
+        """The report's problem (III.A, III.E), with s_min = s_ref and samples only, as printed."""
         return Problem(
             model=DoubleIntegrator(dt=DT, dim=2),
             horizon=self.horizon,
@@ -55,6 +59,7 @@ class Scenario:
             margin=margin,
             inflation=inflation,
             max_obstacles=1,
+            subsamples=subsamples,
         )
 
     def start(self) -> FloatArray:

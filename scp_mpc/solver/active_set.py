@@ -16,6 +16,7 @@ Notation:
 
 from dataclasses import dataclass
 from itertools import count
+from time import perf_counter
 
 import daqp
 import numpy as np
@@ -31,6 +32,7 @@ _ACCURACY = 1e-9  # of a constraint, in its own unit
 _FEW = 4  # variables per row beyond which a program is solved in the span of its rows
 _SMALL = 128  # number of bounds up to which all are taken at once
 _ATTEMPTS = 3  # programs with ever more bounds before all of them are taken
+_LEAST_TIME = 1e-6  # [s] DAQP takes zero for no limit
 _RIDGE = 1e-12  # relative to the largest diagonal entry
 
 
@@ -85,6 +87,11 @@ class ActiveSetSolver:
         """Prepare what all programs share."""
         self._F = np.ascontiguousarray(F)
         self._identity, self._zero = np.eye(F.shape[1]), np.zeros(F.shape[1])
+        self._until = np.inf
+
+    def limit(self, until: float) -> None:
+        """Give up programs that are not solved at this time of `perf_counter`."""
+        self._until = until
 
     def solve(
         self, program: CondensedProgram, active: IntArray, cap: float = np.inf
@@ -178,16 +185,19 @@ class ActiveSetSolver:
         n = rows.shape[1]
         identity = self._identity if rows is wide else np.eye(n)  # DAQP ignores strides
         zero = self._zero[:n]
+        seconds = 0.0  # no limit
+        if self._until < np.inf:
+            seconds = max(self._until - perf_counter(), _LEAST_TIME)
         if np.isfinite(cap):
             model = daqp.Model()
             model.setup(identity, zero, rows, most, least, sense)
-            model.settings = {"primal_tol": _ACCURACY}
+            model.settings = {"primal_tol": _ACCURACY, "time_limit": seconds}
             weight, softness = np.full(len(rows), cap), np.full(len(rows), _YIELDING)
             model.soft_weights(softness, softness, weight, weight)
             v, _, flag, info = model.solve()
         else:
             v, _, flag, info = daqp.solve(
-                identity, zero, rows, most, least, sense, primal_tol=_ACCURACY
+                identity, zero, rows, most, least, sense, primal_tol=_ACCURACY, time_limit=seconds
             )
         if flag not in _SOLVED:
             return None

@@ -3,9 +3,10 @@
 Inputs are rolled out through the dynamics, gradients are taken at the rolled-out positions, and
 multipliers nu of the dynamics follow backwards from stationarity in the states,
 
-    D' nu = phi_e - 2 Q e,     then in the inputs     2 R u - B' nu - beta = 0
+    D' nu = phi_e - 2 Q e,     then in the inputs     2 R u - B' nu - phi_u - beta = 0
 
-has to hold, and for sizes that move 2 w (s - s_ref) - phi_s - beta_s = 0.
+has to hold (phi_u: forces on points between two samples), and for sizes that move
+2 w (s - s_ref) - phi_s - beta_s = 0.
 
 Notation:
     e, u, s     deviations, inputs and sizes
@@ -93,7 +94,7 @@ class Certificate:
         model, c = self._problem.model, self._condensed
         y = np.minimum(np.maximum(y, c.lower), c.upper)
         e = c.deviations(y[c.u].reshape(-1, model.nu))
-        y[c.p] = e[:, model.position].ravel()
+        y[c.p] = c.sampling.deviations(e, y[c.u].reshape(-1, model.nu)).ravel()
         return y, e
 
     def certify(
@@ -108,8 +109,8 @@ class Certificate:
             pushed: The obstacles' part.
         """
         problem, c = self._problem, self._condensed
-        model, w = problem.model, problem.margin.weight
-        u, away = y[c.u].reshape(-1, model.nu), y[c.s] - problem.margin.reference
+        model, w = problem.model, problem.size.weight
+        u, away = y[c.u].reshape(-1, model.nu), y[c.s] - problem.size.reference
         track, effort = e @ problem.Q, u @ problem.R
         track[-1] = e[-1] @ problem.Qf
         cost = float(np.vdot(track, e) + np.vdot(effort, u) + w * (away @ away))
@@ -117,18 +118,21 @@ class Certificate:
         pull = -2 * track
         gradient = np.empty(len(reaction))
         feasibility = product = 0.0
+        on_u = None
         if pushed is not None:
-            phi = np.bincount(
-                pushed.conflicts.at.ravel(),
-                weights=(pushed.force[:, None] * pushed.tangent.a).ravel(),
-                minlength=len(y),
-            )
-            pull[:, model.position] += phi[c.p].reshape(len(e), -1)
+            weights = (pushed.force[:, None] * pushed.tangent.a).ravel()
+            at = pushed.conflicts.at.ravel()
+            phi = np.bincount(at, weights=weights, minlength=len(y)).astype(np.float64)
+            on_e, on_u = c.sampling.pull(phi[c.p])
+            pull += on_e
             gap = pushed.tangent.g + pushed.slack
             feasibility = max(0.0, -float(gap.min()))
             product = max(-float(pushed.force.min()), float(np.abs(pushed.force * gap).max()))
         nu = c.costates(pull)
-        gradient[: u.size] = (2 * effort - nu @ model.B).ravel()
+        thrust = 2 * effort - nu @ model.B
+        if on_u is not None:
+            thrust -= on_u
+        gradient[: u.size] = thrust.ravel()
         if c.moving_sizes:
             gradient[u.size :] = 2 * w * away - (0.0 if pushed is None else phi[c.s])
         if reaction.any():

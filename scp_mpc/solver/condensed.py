@@ -9,7 +9,7 @@ where y_free is the plan that nothing constrains and v are its inputs (and sizes
 that make the Hessian the identity. S depends on model, weights and horizon alone.
 
 Notation:
-    y       [p_1 .. p_N | u_0 .. u_{N-1} | s_1 .. s_M], p as deviation from the reference
+    y       [p_1 .. p_C | u_0 .. u_{N-1} | s_1 .. s_M], p as deviation from the track
     e       (N, nx)     deviations x_i - xref_i, i = 1 .. N
     nu      (N, nx)     multipliers of the dynamics
     H       2 (R + G'QG), Hessian in the inputs, G the map from inputs to e;  H^-1 = L L',  u = L v
@@ -25,8 +25,9 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import splu
 
-from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
+from scp_mpc.solver.sampling import Sampling
 
 
 class Condensed:
@@ -47,13 +48,14 @@ class Condensed:
         numpy.linalg.LinAlgError: The Hessian in the inputs is singular: R = 0, say.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, sampling: Sampling | None = None) -> None:
         """Factorise the KKT matrix of the unconstrained problem and build S."""
         self._problem = problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        margin = problem.margin
+        margin = problem.size
+        self.sampling = Sampling(model, N, 1) if sampling is None else sampling
         self._states = N * model.nx
-        self.p = slice(0, N * model.dim)
+        self.p = slice(0, self.sampling.points * model.dim)
         self.u = slice(self.p.stop, self.p.stop + N * model.nu)
         self.s = slice(self.u.stop, self.u.stop + M)
         # A size that cannot shrink never moves: larger ones only cost more and leave less room.
@@ -66,10 +68,9 @@ class Condensed:
         self._kkt = splu(self._kkt_matrix(D))
         self._right = np.zeros(self._kkt.shape[0])
         self._drift = np.zeros((N, model.nx))
-        self._from = self._outputs()
         self._sizes = np.full(M, margin.reference)
         self.response = self._respond()
-        unbounded = np.full(N * model.dim, np.inf)
+        unbounded = np.full(self.p.stop, np.inf)
         self.lower = np.concatenate(
             [-unbounded, np.tile(problem.u_min, N), np.full(M, margin.lower)]
         )
@@ -83,7 +84,9 @@ class Condensed:
         self._drift = x_ref[:-1] @ A.T - x_ref[1:]
         self._drift[0] = A @ x0 - x_ref[1]
         self._right[-self._states :] = self._drift.ravel()
-        return np.concatenate([self._kkt.solve(self._right)[self._from], self._sizes])
+        e, u = self._parts(self._kkt.solve(self._right))
+        p = self.sampling.deviations(e, u)
+        return np.concatenate([p.ravel(), u.ravel(), self._sizes])
 
     def deviations(self, inputs: FloatArray) -> FloatArray:
         """Roll inputs (N, nu) out from this step's x0: e (N, nx)."""
@@ -105,23 +108,24 @@ class Condensed:
         blocks: Any = [[Q, None, D.T], [None, R, -B.T], [D, -B, None]]
         return sparse.csc_matrix(sparse.bmat(blocks))
 
-    def _outputs(self) -> IntArray:
-        """Places of positions and inputs within the KKT system's unknowns."""
-        model, N = self._problem.model, self._problem.horizon
-        p = np.arange(N)[:, None] * model.nx + model.position
-        return np.concatenate([p.ravel(), self._states + np.arange(N * model.nu)])
+    def _parts(self, solved: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deviations e (N, nx) and inputs (N, nu) within the KKT system's unknowns."""
+        model, inputs = self._problem.model, self._problem.horizon * self._problem.model.nu
+        e, u = solved[: self._states], solved[self._states : self._states + inputs]
+        return e.reshape(-1, model.nx), u.reshape(-1, model.nu)
 
     def _respond(self) -> FloatArray:
         """Push every input with a unit force: inputs answer with H^-1, positions with G H^-1."""
-        margin, M = self._problem.margin, self._problem.max_obstacles
+        margin, M = self._problem.size, self._problem.max_obstacles
         pushes = self.u.stop - self.u.start
         push = np.zeros((len(self._right), pushes))
         push[self._states + np.arange(pushes), np.arange(pushes)] = 1.0
-        moved = self._kkt.solve(push)[self._from]
-        inverse = (moved[self.u] + moved[self.u].T) / 2
-        L = np.linalg.cholesky(inverse)
+        parts = [self._parts(column) for column in self._kkt.solve(push).T]
+        positions = np.array([self.sampling.deviations(e, u).ravel() for e, u in parts]).T
+        moved = np.array([u.ravel() for _, u in parts]).T
+        L = np.linalg.cholesky((moved + moved.T) / 2)
         S = np.zeros((self.s.stop, pushes + self.moving_sizes))
-        S[self.p, :pushes] = solve_triangular(L, moved[self.p].T, lower=True).T
+        S[self.p, :pushes] = solve_triangular(L, positions.T, lower=True).T
         S[self.u, :pushes] = L
         if self.moving_sizes:
             S[self.s, pushes:] = np.eye(M) / np.sqrt(2 * margin.weight)

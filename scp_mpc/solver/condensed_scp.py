@@ -2,12 +2,13 @@
 
 The plan that ignores the obstacles costs one linear system, or one program where inputs reach
 their bounds. If it is clear of every obstacle, nothing can be better. Else the descent of
-`newton.py` runs on the pairs of obstacle and stage that are near; all others stay out, and are
+`newton.py` runs on the pairs of obstacle and point that are near; all others stay out, and are
 rechecked where it ends.
 """
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,11 +24,12 @@ from scp_mpc.solver.conflicts import Conflicts
 from scp_mpc.solver.descent import Descent, Glimpse, judge
 from scp_mpc.solver.iterate import NEGLIGIBLE, Iterate, Multipliers, moved
 from scp_mpc.solver.newton import Newton
+from scp_mpc.solver.sampling import Sampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
-_MANY = 200  # pairs beyond which sparse programs are quicker than dense ones
+_MANY = 200  # pairs of obstacle and stage beyond which sparse programs are quicker than dense ones
 
 
 class CondensedSCP:
@@ -43,10 +45,10 @@ class CondensedSCP:
         self._position = problem.model.position
 
     @classmethod
-    def of(cls, problem: Problem, settings: Settings) -> "CondensedSCP | None":
+    def of(cls, problem: Problem, settings: Settings, sampling: Sampling) -> "CondensedSCP | None":
         """Condense a problem; None where the inputs' Hessian is singular."""
         try:
-            return cls(problem, settings, Condensed(problem))
+            return cls(problem, settings, Condensed(problem, sampling))
         except (np.linalg.LinAlgError, RuntimeError):
             return None
 
@@ -57,7 +59,12 @@ class CondensedSCP:
 
     def begin(self, step: StepData, watch: Stopwatch) -> None:
         """Read a control step and find the plan that nothing constrains."""
+        self._qp.limit(watch.deadline)
         self._at = CondensedStep(self._problem, self._condensed, self._qp, step, watch)
+
+    def widen(self, step: StepData) -> None:
+        """Take other radii or sizes for the step that has begun."""
+        self._at.data = step
 
     def unhindered(self) -> Descent | None:
         """The plan that ignores the obstacles, if it is clear of them all: none costs less."""
@@ -73,7 +80,7 @@ class CondensedSCP:
         return self._iterate(self._at.free_point(), np.inf)
 
     def free_path(self) -> FloatArray:
-        """Its positions (N, d)."""
+        """Its positions (C, d)."""
         return self._at.path(self._at.within_bounds[0])[1:]
 
     def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
@@ -87,14 +94,13 @@ class CondensedSCP:
         at, c, data = self._at, self._condensed, self._at.data
         if not data.count:  # the free plan was the only one, and it did not hold up
             return None
-        path = nominal.states[:, self._position]
-        p = path[1:] - data.x_ref[1:, self._position]
+        p = c.sampling.positions(nominal.states, nominal.inputs) - data.track[1:]
         y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
         near = touched = nominal.touched[: data.count]
         bounds, iterations = self._active_bounds(nominal), 0
         while True:
             near = self._near(at.path(y)[None], y[c.s], near)
-            if np.count_nonzero(near) > _MANY:
+            if np.count_nonzero(near) > _MANY * c.sampling.count:
                 return None
             conflicts = Conflicts(data, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
@@ -112,7 +118,7 @@ class CondensedSCP:
     def glimpses(
         self, best: Iterate, paths: Sequence[FloatArray], firm: bool = True
     ) -> list[Glimpse]:
-        """Solve one program about each path (N, d), all linearised at once.
+        """Solve one program about each path (C, d), all linearised at once.
 
         Args:
             best: Whose bounds and sizes to begin with.
@@ -121,14 +127,16 @@ class CondensedSCP:
         """
         if not paths:
             return []
-        at, data = self._at, self._at.data
-        whole = np.empty((len(paths), len(data.x_ref), len(self._position)))
+        at, c, data = self._at, self._condensed, self._at.data
+        whole = np.empty((len(paths), len(data.track), len(self._position)))
         whole[:, 0], whole[:, 1:] = data.x0[self._position], paths
-        known = np.stack([at.path(at.within_bounds[0]), best.states[:, self._position]])
+        here = whole[0].copy()
+        here[1:] = c.sampling.positions(best.states, best.inputs)
+        known = np.stack([at.path(at.within_bounds[0]), here])
         near = self._near(known, best.s, np.zeros((data.count, len(paths[0])), dtype=np.bool_))
-        if np.count_nonzero(near) > _MANY:
+        if np.count_nonzero(near) > _MANY * c.sampling.count:
             return []
-        conflicts = Conflicts(data, self._condensed, near)
+        conflicts = Conflicts(data, c, near)
         with at.watch.linearising:
             a, b = conflicts.about(whole, best.s)
         with at.watch.solving:
@@ -154,18 +162,26 @@ class CondensedSCP:
             end = self._qp.glimpse(program, bounds, cap)
         if end is None:
             nobody = np.zeros(shape, dtype=np.bool_)
-            return Glimpse(np.inf, nobody, partial(moved, best, self._position, path))
+            samples = path[self._condensed.sampling.count - 1 :: self._condensed.sampling.count]
+            return Glimpse(np.inf, nobody, path, partial(moved, best, self._position, samples))
         self._at.finished["daqp"] += 1
         v, pushing = end
-        reached = self._at.path(self._at.y(v))[1:]
+        y = self._at.y(v)
         merit = self._at.least + float(v @ v) / 2
         if np.isfinite(cap):
             merit += cap * float(np.maximum(program.b - program.A @ v, 0.0).sum())
-        start = partial(moved, best, self._position, reached)
-        return Glimpse(merit, conflicts.table(pushing, *shape), start)
+        start = partial(self._reached, best, y)
+        return Glimpse(merit, conflicts.table(pushing, *shape), self._at.path(y)[1:], start)
+
+    def _reached(self, best: Iterate, y: FloatArray) -> Iterate:
+        """An iterate's bounds and sizes about the plan y."""
+        states = self._at.data.x_ref.copy()
+        inputs = y[self._condensed.u].reshape(-1, self._problem.model.nu)
+        states[1:] += self._condensed.deviations(inputs)
+        return replace(best, states=states, inputs=inputs)
 
     def _near(self, paths: FloatArray, s: FloatArray, near: BoolArray) -> BoolArray:
-        """Pairs in `near` (J, N), or near to one of the paths (C, N+1, d); all if there is none."""
+        """Pairs in `near` (J, C), or near to one of the paths (c, C+1, d); all if there is none."""
         for path in paths:
             more = self._at.data.within(path, s, _NEAR, known=near)
             near = near if more is None else near | more
@@ -198,12 +214,12 @@ class CondensedSCP:
         states = np.empty_like(data.x_ref)
         states[0] = data.x0
         np.add(data.x_ref[1:], point.deviations, out=states[1:])
-        slack, forces = np.zeros((M, N)), np.zeros((M, N))
+        slack, forces = np.zeros((2, M, c.sampling.points))
         margin: FloatArray = -point.reaction[N * nu :] if c.moving_sizes else np.zeros(M)
         if point.pushed is not None:
             pairs, force = point.pushed.conflicts, point.pushed.force
-            slack[pairs.obstacle, pairs.stage] = point.pushed.slack
-            forces[pairs.obstacle, pairs.stage] = force
+            slack[pairs.obstacle, pairs.point] = point.pushed.slack
+            forces[pairs.obstacle, pairs.point] = force
             if not c.moving_sizes:  # the bound takes whatever pushes a size that cannot move
                 pull = force * point.pushed.tangent.a[:, -1]
                 margin = np.bincount(pairs.obstacle, weights=pull, minlength=M).astype(np.float64)

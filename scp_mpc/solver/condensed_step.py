@@ -81,7 +81,7 @@ class CondensedStep:
         return moved
 
     def path(self, y: FloatArray) -> FloatArray:
-        """(N+1, d) positions of the robot in y, from now on [m]."""
+        """(C+1, d) positions of the robot in y, from now on [m]."""
         return self.data.path(y[self.condensed.p])
 
     def convex(self, conflicts: Conflicts, tangent: Tangent) -> CondensedProgram:

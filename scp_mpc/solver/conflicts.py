@@ -1,7 +1,7 @@
-"""The pairs of obstacle and stage that can matter in one control step; all others stay out.
+"""The pairs of obstacle and point that can matter in one control step; all others stay out.
 
 Notation:
-    K           number of pairs (j, i)
+    K           number of pairs (j, i); i counts points: samples, and those between them
     y           outputs of the condensed problem, see `condensed.py`
     g   (K,)    constraint function, to be non-negative [m]
     a   (K, w)  its gradient with respect to y[at]: position and size, w = d + 1
@@ -37,58 +37,60 @@ class Tangent:
 
 
 class Conflicts:
-    """Geometry of some pairs of obstacle and stage in one control step.
+    """Geometry of some pairs of obstacle and point in one control step.
 
     Attributes:
-        obstacle: (K,) j; likewise `stage`, counted from 0.
+        obstacle: (K,) j; likewise `point`, i, counted from 0.
         at: (K, w) where position and size stand in y.
         response: (K, w, nv) rows of S there.
 
     Args:
         step: The control step.
         condensed: Where positions and sizes stand in y.
-        near: (J, N) the pairs.
+        near: (J, C) the pairs.
     """
 
     def __init__(self, step: StepData, condensed: Condensed, near: BoolArray) -> None:
         """Gather the pairs' predictions."""
-        self.obstacle, self.stage = j, i = np.nonzero(near)
+        self.obstacle, self.point = j, i = np.nonzero(near)
         d = step.problem.model.dim
         self.at = np.empty((len(j), d + 1), dtype=np.intp)
         self.at[:, :d] = i[:, None] * d + np.arange(d)
         self.at[:, d] = condensed.s.start + j
         self.response = condensed.response[self.at]
         self._step, self._p = step, condensed.p
-        self._sets = NoGoSets.pairs(step.means[j, i + 1], step.covariances[j, i + 1], step.radii[j])
+        covariances = step.covariances[j, i + 1]
+        self._sets = NoGoSets.pairs(step.means[j, i + 1], covariances, step.radii[j, i])
         self._means_before = step.means[j, i]
 
     def about(self, paths: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Linearise about several paths (C, N+1, d) at sizes s (M,) at once.
+        """Linearise about several paths (c, C+1, d) at sizes s (M,) at once.
 
         Returns:
-            Gradients a (C, K, w) and right-hand sides b (C, K) of a' (p, s) >= b, where p is the
-            deviation from the reference.
+            Gradients a (c, K, w) and right-hand sides b (c, K) of a' (p, s) >= b, where p is the
+            deviation from the track.
         """
-        count, K = len(paths), len(self.stage)
+        count, K = len(paths), len(self.point)
         tiled = self._sets.taken(np.tile(np.arange(K), count))
-        positions = paths[:, self.stage + 1]
-        before = paths[:, self.stage] - self._means_before
+        positions = paths[:, self.point + 1]
+        before = paths[:, self.point] - self._means_before
         d = positions.shape[-1]
         sizes = np.tile(s[self.obstacle], count)
         spaces = self._step.problem.no_go.linearise(
             tiled, positions.reshape(-1, 1, d), sizes, before.reshape(-1, d)
         )
         normal = spaces.normal.reshape(count, K, d)
-        reference = self._step.x_ref[self.stage + 1][:, self._step.problem.model.position]
-        b = spaces.offset.reshape(count, K) - (normal * reference).sum(axis=2)
+        b = spaces.offset.reshape(count, K) - (normal * self._step.track[self.point + 1]).sum(
+            axis=2
+        )
         return np.concatenate([normal, spaces.slope.reshape(count, K, 1)], axis=2), b
 
     def tangent(self, y: FloatArray) -> Tangent:
         """Linearise about y."""
         path = self._step.path(y[self._p])
-        positions, s = path[self.stage + 1][:, None], y[self.at[:, -1]]
+        positions, s = path[self.point + 1][:, None], y[self.at[:, -1]]
         spaces = self._step.problem.no_go.linearise(
-            self._sets, positions, s, path[self.stage] - self._means_before
+            self._sets, positions, s, path[self.point] - self._means_before
         )
         a = np.concatenate([spaces.normal[:, 0], spaces.slope], axis=1)
         return Tangent(y, spaces.value[:, 0], a, spaces)
@@ -99,8 +101,8 @@ class Conflicts:
         no_go = self._step.problem.no_go
         return no_go.bend(self._sets, s, tangent.spaces)[:, 0]
 
-    def table(self, marked: BoolArray, slots: int, stages: int) -> BoolArray:
-        """Return which pairs are marked (K,) as (slots, stages)."""
-        table = np.zeros((slots, stages), dtype=np.bool_)
-        table[self.obstacle, self.stage] = marked
+    def table(self, marked: BoolArray, slots: int, points: int) -> BoolArray:
+        """Return which pairs are marked (K,) as (slots, points)."""
+        table = np.zeros((slots, points), dtype=np.bool_)
+        table[self.obstacle, self.point] = marked
         return table

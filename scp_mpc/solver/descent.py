@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-from scp_mpc.arrays import BoolArray
+from scp_mpc.arrays import BoolArray, FloatArray
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
@@ -51,12 +51,14 @@ class Glimpse:
 
     Attributes:
         merit: Cost and penalty on the slack; infinite if there is no solution without slack.
-        touched: (J, N) which obstacles push it, at which stages.
+        touched: (J, C) which obstacles push it, at which points.
+        path: (C, d) its positions.
         make: Makes the iterate.
     """
 
     merit: float
     touched: BoolArray
+    path: FloatArray
     make: Callable[[], Iterate]
 
     @cached_property

@@ -21,13 +21,15 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
     if not isinstance(guess, Trajectory | Iterate):
         raise InvalidArgumentError("guess", f"{guess!r} is neither a Trajectory nor an Iterate")
     if isinstance(guess, Trajectory):
-        s = np.full(M, problem.margin.reference)
+        s = np.full(M, problem.size.reference)
         guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N)))
     path = {"states": (N + 1, model.nx), "inputs": (N, model.nu)}
-    _check(guess, {**path, "s": (M,), "slack": (M, N)})
+    fine = guess.slack.shape == (M, N * problem.subsamples)
+    points = N * problem.subsamples if fine else N
+    _check(guess, {**path, "s": (M,), "slack": (M, points)})
     if guess.multipliers is not None:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}
-        _check(guess.multipliers, {**shapes, "obstacles": (M, N), "slack": (M, N)})
+        _check(guess.multipliers, {**shapes, "obstacles": (M, points), "slack": (M, points)})
     return guess
 
 

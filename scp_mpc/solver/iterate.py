@@ -2,7 +2,8 @@
 
 Notation:
     X (N+1, nx)     states              s       (M,)    sizes of the ellipsoids
-    U (N, nu)       inputs              slack   (M, N)  violation per obstacle and stage [m]
+    U (N, nu)       inputs              slack   (M, C)  violation per obstacle and point [m]
+    C               points at which obstacles are constrained: N, or K in each of N intervals
 """
 
 from dataclasses import dataclass, replace
@@ -23,8 +24,8 @@ class Multipliers:
         dynamics: (N, nx) of x_{i+1} - A x_i - B u_i = 0.
         inputs: (N, nu) of the input bounds.
         margin: (M,) of the bounds on s.
-        obstacles: (M, N) of the obstacles' constraints, never positive.
-        slack: (M, N) of slack = 0, or of slack >= 0 where it is free.
+        obstacles: (M, C) of the obstacles' constraints, never positive.
+        slack: (M, C) of slack = 0, or of slack >= 0 where it is free.
     """
 
     dynamics: FloatArray
@@ -39,9 +40,16 @@ class Multipliers:
             _shifted(self.dynamics, 0),
             _shifted(self.inputs, 0),
             self.margin,
-            _shifted(self.obstacles, 1),
-            _shifted(self.slack, 1),
+            _shifted(self.obstacles, 1, len(self.inputs)),
+            _shifted(self.slack, 1, len(self.inputs)),
         )
+
+    def resampled(self, count: int) -> "Multipliers":
+        """The same with another number of points per interval: forces move to the sample after."""
+        N = len(self.inputs)
+        groups = [f.reshape(len(f), N, -1).sum(axis=2) for f in (self.obstacles, self.slack)]
+        obstacles, slack = (_at_samples(group, count) for group in groups)
+        return replace(self, obstacles=obstacles, slack=slack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +69,7 @@ class Iterate:
 
     @property
     def touched(self) -> BoolArray:
-        """Which obstacles push this point, at which stages: (M, N)."""
+        """Which obstacles push this point, at which points: (M, C)."""
         duals = self.multipliers
         if duals is None:
             return np.zeros(self.slack.shape, dtype=np.bool_)
@@ -82,9 +90,18 @@ class Iterate:
             np.concatenate([self.states[1:], last[None]]),
             _shifted(self.inputs, 0),
             self.s,
-            _shifted(self.slack, 1),
+            _shifted(self.slack, 1, len(self.inputs)),
             None if self.multipliers is None else self.multipliers.shifted(),
         )
+
+    def resampled(self, count: int) -> "Iterate":
+        """The same with another number of points per interval."""
+        N = len(self.inputs)
+        if self.slack.shape[1] == N * count:
+            return self
+        slack = self.slack.reshape(len(self.slack), N, -1).max(axis=2)
+        duals = None if self.multipliers is None else self.multipliers.resampled(count)
+        return replace(self, slack=_at_samples(slack, count), multipliers=duals)
 
 
 def moved(iterate: Iterate, position: IntArray, path: FloatArray) -> Iterate:
@@ -94,7 +111,17 @@ def moved(iterate: Iterate, position: IntArray, path: FloatArray) -> Iterate:
     return replace(iterate, states=states)
 
 
-def _shifted(values: FloatArray, axis: int) -> FloatArray:
-    """Drop the first entry along `axis` and repeat the last."""
-    stages = np.minimum(np.arange(values.shape[axis]) + 1, values.shape[axis] - 1)
-    return values.take(stages, axis=axis)
+def _shifted(values: FloatArray, axis: int, stages: int = 0) -> FloatArray:
+    """Drop the first stage along `axis` and repeat the last; a stage may have several entries."""
+    size = values.shape[axis]
+    count = size // stages if stages else 1
+    places = np.arange(size) + count
+    places[size - count :] -= count
+    return values.take(places, axis=axis)
+
+
+def _at_samples(values: FloatArray, count: int) -> FloatArray:
+    """Spread values (M, N) to `count` points per stage (M, N count): zero but at the last."""
+    spread = np.zeros((*values.shape, count))
+    spread[..., -1] = values
+    return spread.reshape(len(values), -1)

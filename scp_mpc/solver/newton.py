@@ -50,7 +50,7 @@ class End:
 
 
 class Newton:
-    """Descends about some pairs of obstacle and stage in one control step.
+    """Descends about some pairs of obstacle and point in one control step.
 
     Args:
         step: The control step.
@@ -74,13 +74,20 @@ class Newton:
     def descend(self, y: FloatArray, active: IntArray, limit: int) -> End | None:
         """Descend from y (ny,), for at most `limit` programs; None if given up or unsolved."""
         tangent, end, leaps, bold = self._conflicts.tangent(y), None, 0, True
+        watch = self._step.watch
         for iteration in range(1, limit + 1):
+            if not watch.affords("program"):
+                break
+            began = watch.elapsed
             solved = self._solve(tangent, active)
             if solved is None:
+                if watch.remaining < 0:
+                    break
                 return None
             program, held = solved
             ahead = self._ahead(tangent, program, held, leaps) if bold else None
             point = self._step.point(self._conflicts, ahead if isinstance(ahead, Held) else held)
+            watch.learn("program", began)
             if leaps and end is not None and self._merit(point) > self._merit(end.point):
                 tangent, leaps, bold = end.point.tangent, 0, False  # take the leap back
                 continue
@@ -91,8 +98,6 @@ class Newton:
                 break
             if self._goal is not None and self._vain(iteration, point, self._goal):
                 return None
-            if self._step.watch.overdue():
-                break
             if isinstance(ahead, np.ndarray):
                 tangent, leaps, bold = self._conflicts.tangent(ahead), leaps + 1, True
             else:
@@ -141,11 +146,12 @@ class Newton:
             return True
         if abs(point.cost - goal.cost) > _ALIKE * goal.cost or point.pushed is None:
             return False
-        problem, count = self._step.problem, self._step.data.count
-        pushes = self._conflicts.table(point.pushed.force > NEGLIGIBLE, count, problem.horizon)
+        count = self._step.data.count
+        sampling, other = self._step.data.sampling, goal.iterate
+        pushes = self._conflicts.table(point.pushed.force > NEGLIGIBLE, count, sampling.points)
         mine = Passing(self._step.path(point.y)[1:], pushes)
-        theirs = goal.iterate.states[1:, problem.model.position]
-        return same_way(self._step.data, mine, Passing(theirs, goal.iterate.touched[:count]))
+        theirs = sampling.positions(other.states, other.inputs)
+        return same_way(self._step.data, mine, Passing(theirs, other.touched[:count]))
 
     def _merit(self, point: Point) -> float:
         return point.cost + self._step.problem.slack_weight * point.slack

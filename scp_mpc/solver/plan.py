@@ -1,9 +1,12 @@
 """What the solver returns: a plan, how it ended, and how far it can be trusted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.solver.commitment import PlanRisk
 from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.solver.program import KKTResiduals
 
@@ -13,19 +16,25 @@ class Status(Enum):
 
     CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
     FEASIBLE = "The plan meets every constraint, but the search ended before it was optimal."
+    PREVIOUS = "Nothing better in time: the last plan, shifted, meets every constraint as of now."
+    BRAKING = "Nothing better in time: the robot brakes and meets every constraint while it does."
     SOFTENED = "No plan that meets every constraint was found; this one violates them by its slack."
     VIOLATING = "The search ended while the plan still violates a constraint."
-    FALLBACK = "No quadratic program could be solved; the inputs of the guess are kept."
+    FALLBACK = "No plan was computed and none is known that meets every constraint: brake."
+    STALE = "The predictions are too old to plan with: brake, whatever is in the way."
 
     @property
     def ok(self) -> bool:
-        """Whether every constraint of the problem holds."""
-        return self in (Status.CONVERGED, Status.FEASIBLE)
+        """Whether every constraint of the problem holds, so that the plan is safe to follow."""
+        return self in _SAFE
 
     @property
     def certified(self) -> bool:
         """Whether the KKT conditions hold, with slack or without."""
         return self in (Status.CONVERGED, Status.SOFTENED)
+
+
+_SAFE = (Status.CONVERGED, Status.FEASIBLE, Status.PREVIOUS, Status.BRAKING)
 
 
 @dataclass(frozen=True)
@@ -63,8 +72,9 @@ class Plan:
     Attributes:
         X: (N+1, nx) states, row 0 the given one.
         U: (N, nu) inputs.
-        s: (M,) sizes of the obstacles' ellipsoids.
-        slack: (M, N) violation of each obstacle's constraint at stages 1 .. N [m].
+        s: (M,) sizes of the obstacles' ellipsoids; where a risk is promised, see `risk` instead.
+        slack: (M, N) violation of each obstacle's constraint at stages 1 .. N, or between a stage
+            and the one before [m].
         cost: Value of the objective, slack not included.
         status: How it ended.
         kkt: Residuals of the original problem's KKT conditions at this plan.
@@ -74,7 +84,8 @@ class Plan:
             "piqp".
         candidates: Rival plans on other sides that were tried; `switched` if one of them won.
         timing: Seconds spent.
-        iterate: The point with its multipliers, padded to all obstacle slots.
+        iterate: The point with its multipliers, padded to all obstacle slots, at all points.
+        commitment: Computes `risk`.
     """
 
     X: FloatArray
@@ -90,6 +101,7 @@ class Plan:
     switched: bool
     timing: Timing
     iterate: Iterate
+    commitment: Callable[[], PlanRisk]
 
     @property
     def u0(self) -> FloatArray:
@@ -100,6 +112,11 @@ class Plan:
     def ok(self) -> bool:
         """Whether every constraint holds, so that the plan is safe to follow."""
         return self.status.ok
+
+    @cached_property
+    def risk(self) -> PlanRisk:
+        """Bounds of the collision probability, computed when they are asked for."""
+        return self.commitment()
 
     @property
     def multipliers(self) -> Multipliers | None:

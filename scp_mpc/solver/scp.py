@@ -3,40 +3,49 @@
     free plan, which ignores the obstacles: if it is clear of them, nothing can be better
     nominal = previous plan, shifted (or the free plan)
     descend:  half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
-              residual of the original problem is below the tolerance
+              residual of the original problem is below the tolerance, or the time is up
     sides:    where an obstacle shapes the plan, the same from paths on its other sides;
               the best plan wins, if by enough
+    allocate: where a joint risk is promised, give it to those who need it, and descend again
+    ladder:   without a plan that meets every constraint, the previous one, or braking
 
-Descents run on the condensed problem (`condensed_scp.py`). Where that has no answer, or the
-settings say so, they run on the sparse one (`sparse_scp.py`).
+Where the robot is fast, constraints hold at points between the samples, too (`resolution.py`).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from threading import Lock
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import BoolArray
+from scp_mpc.arrays import frozen
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
+from scp_mpc.safety.allocation import reallocated
+from scp_mpc.safety.margin import JointRisk
+from scp_mpc.safety.risk import size_at_risk
 from scp_mpc.settings import Settings
-from scp_mpc.solver.condensed_scp import CondensedSCP
+from scp_mpc.solver.commitment import plan_risk, point_risks
 from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.engine import Engine
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.ladder import Ladder
 from scp_mpc.solver.plan import Candidate, Plan, Status, Timing
+from scp_mpc.solver.resolution import Resolution, exposed
 from scp_mpc.solver.sides import Passing, candidates, same_way
-from scp_mpc.solver.sparse_scp import SparseSCP
 from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.solver.stopwatch import Pace, Stopwatch
 from scp_mpc.trajectory import Trajectory
 
 # A rival must be better by this share, or the plan flickers between sides of equal cost.
 _HYSTERESIS = 0.001
-_SHARE = 0.5  # of the deadline, after which no other side is tried
+_CORRECTIONS = 3  # of what was assumed about the motion between points
+_ROUNDS = 6  # of risk allocation at most
+_GAIN = 0.001  # share of the cost that makes another round worth while
 
 
 class SCP:
@@ -53,12 +62,9 @@ class SCP:
         self.settings = Settings() if settings is None else settings
         if not isinstance(self.settings, Settings):
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
-        self._busy = Lock()
-        self._sparse = SparseSCP(problem, self.settings)
-        self._condensed = (
-            CondensedSCP.of(problem, self.settings) if self.settings.condense else None
-        )
-        self._engine: CondensedSCP | SparseSCP = self._condensed or self._sparse
+        self._busy, self._pace = Lock(), Pace()
+        self._resolution = Resolution(problem, self.settings)
+        self._ladder = Ladder(problem, self.settings.tolerance)
 
     def solve(
         self,
@@ -67,6 +73,7 @@ class SCP:
         obstacles: Sequence[ObstaclePrediction] = (),
         guess: Trajectory | Iterate | None = None,
         challenge: bool = True,
+        robot_covariance: ArrayLike | None = None,
     ) -> Plan:
         """Plan from the state x0 along the reference and around the obstacles.
 
@@ -76,15 +83,16 @@ class SCP:
             obstacles: At most `max_obstacles` predictions over the same horizon.
             guess: Where to linearise first; None for the plan that ignores the obstacles.
             challenge: Try the other sides even if this one works, unless `settings.sides` is off.
+            robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2]; adds to the
+                obstacles'.
 
         Raises:
             InvalidArgumentError: Or one of its subclasses, before anything is changed.
             ConcurrentUseError: Another thread is using this solver.
         """
         nominal = None if guess is None else as_iterate(guess, self.problem)
-        return self.solve_from(
-            x0, x_ref, obstacles, None if nominal is None else lambda: nominal, challenge
-        )
+        shifted = None if nominal is None else lambda: nominal
+        return self.solve_from(x0, x_ref, obstacles, shifted, challenge, robot_covariance)
 
     def solve_from(
         self,
@@ -93,65 +101,77 @@ class SCP:
         obstacles: Sequence[ObstaclePrediction],
         nominal: Callable[[], Iterate] | None,
         challenge: bool,
+        robot_covariance: ArrayLike | None = None,
     ) -> Plan:
         """`solve`, with a nominal plan that is made only where it is needed."""
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
-            return self._solve(x0, x_ref, obstacles, nominal, challenge)
+            watch = Stopwatch(self.settings.deadline, self._pace)
+            sampling = self._resolution.coarse.sampling
+            step = StepData.read(self.problem, x0, x_ref, obstacles, robot_covariance, sampling)
+            return self._solve(step, watch, nominal, challenge)
         finally:
             self._busy.release()
 
+    def brake(self, x0: ArrayLike, x_ref: ArrayLike, status: Status = Status.BRAKING) -> Plan:
+        """Bring the robot to rest at the model's limits, whatever is in the way."""
+        watch = Stopwatch()
+        step = StepData.read(self.problem, x0, x_ref, ())
+        found = _Found(self._ladder.brake(step, status))
+        return self._plan(step, found, watch, {})
+
     def forget(self) -> None:
         """Forget what earlier programs left behind: the next step is that of a new solver."""
-        self._sparse.forget()
+        self._resolution.forget()
 
     def _solve(
         self,
-        x0: ArrayLike,
-        x_ref: ArrayLike,
-        obstacles: Sequence[ObstaclePrediction],
+        step: StepData,
+        watch: Stopwatch,
         nominal: Callable[[], Iterate] | None,
         challenge: bool,
     ) -> Plan:
-        watch = Stopwatch(self.settings.deadline)
-        step = StepData.read(self.problem, x0, x_ref, obstacles)
         if nominal is None:
             self.forget()
-        self._engine.begin(step, watch)
-        tried: tuple[Candidate, ...] = ()
-        switched = False
-        best = self._engine.unhindered()
-        if best is None:
-            start = self._engine.free() if nominal is None else nominal()
-            best = self._descend(step, watch, start)
-            wanted = not best.status.ok or (challenge and best.iterate.touches)
-            if self.settings.sides and wanted and not watch.overdue(_SHARE):
-                best, tried, switched = self._challenge(step, best)
-        return self._plan(step, best, tried, switched, watch)
+        engine, step, free = self._resolution.begin(step, watch)
+        if free is not None:
+            return self._plan(step, _Found(free), watch, self._resolution.finished(engine))
+        last = None if nominal is None else nominal().resampled(engine.sampling.count)
+        start = engine.free() if last is None else last
+        sweep = self._resolution.assumed(engine, start)
+        for _ in range(_CORRECTIONS):
+            wide = self._resolution.widened(engine, step, sweep)
+            found = _Found(engine.descend(start) or self._ladder.resort(wide, last))
+            if self._contested(found.best, challenge) and watch.affords("ways"):
+                found = self._challenge(engine, wide, watch, found.best)
+            found = self._allocate(engine, wide, watch, found)
+            found = self._rescue(engine, wide, last, found)
+            if self._resolution.kept(engine, step, sweep, found.best):
+                break
+            start = found.best.iterate
+            sweep = self._resolution.corrected(engine, sweep, found.best)
+        else:
+            found = replace(found, best=exposed(found.best))
+        return self._plan(wide, found, watch, self._resolution.finished(engine))
 
-    def _descend(self, step: StepData, watch: Stopwatch, nominal: Iterate) -> Descent:
-        """Descend on the condensed problem; on the sparse one where that has no answer."""
-        limit = self.settings.max_iterations
-        if self._condensed is None:
-            return self._sparse.descend(nominal, limit)
-        best = self._condensed.descend(nominal, limit)
-        if best is not None and (best.status is not Status.VIOLATING or watch.overdue()):
-            return best
-        self._sparse.begin(step, watch)
-        other = self._sparse.descend(nominal, limit)
-        return other if best is None or other.beats(best, lead=0.0) else best
+    def _contested(self, best: Descent, challenge: bool) -> bool:
+        """Whether other ways past the obstacles are worth a look."""
+        wanted = not best.status.ok or (challenge and best.iterate.touches)
+        return self.settings.sides and wanted
 
     def _challenge(
-        self, step: StepData, best: Descent
-    ) -> tuple[Descent, tuple[Candidate, ...], bool]:
+        self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent
+    ) -> "_Found":
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        full = np.full(self.problem.max_obstacles, self.problem.margin.reference)
-        here = self._passing(best.iterate, best.iterate.touched[: step.count])
-        sides = candidates(step, self._engine.free_path(), here.path, full)
+        began = watch.elapsed
+        full = np.full(self.problem.max_obstacles, self.problem.size.reference)
+        here = Passing(engine.path(best.iterate), best.iterate.touched[: step.count])
+        sides = candidates(step, engine.free_path(), here.path, full)
         present = replace(best.iterate, s=full)
         safe = best.status.ok
-        starts = self._engine.glimpses(present, [side.path for side in sides], firm=safe)
+        starts = engine.glimpses(present, [side.path for side in sides], firm=safe)
+        watch.learn("ways", began)
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=False)  # none if they are too many
@@ -160,48 +180,85 @@ class SCP:
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
         # A plan with slack is followed by any without: then all ways are worth their time.
         for start in ranked[: self.settings.rivals] if safe else ranked:
-            if not safe and goal.status.ok:
+            if (not safe and goal.status.ok) or not watch.affords("program"):
                 break
-            if safe and same_way(step, self._passing(start.iterate, start.touched), here):
+            if safe and same_way(step, Passing(start.path, start.touched), here):
                 continue  # this way leads to where we are
-            rival = self._engine.descend(start.iterate, self.settings.max_iterations, goal)
+            rival = engine.follow(start.iterate, goal)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
-        return goal, tried, switched
+        return _Found(goal, tried, switched)
 
-    def _passing(self, iterate: Iterate, touched: BoolArray) -> Passing:
-        return Passing(iterate.states[1:, self.problem.model.position], touched)
+    def _allocate(
+        self, engine: Engine, step: StepData, watch: Stopwatch, found: "_Found"
+    ) -> "_Found":
+        """Iterative risk allocation: the plan stays feasible, so that its cost cannot rise."""
+        margin, best = self.problem.margin, found.best
+        if not isinstance(margin, JointRisk) or margin.allocation == "uniform":
+            return found
+        allocated = np.full(step.radii.shape, margin.delta / step.radii.size)
+        for _ in range(_ROUNDS):
+            if not (best.status.ok and best.iterate.touches and watch.affords("program")):
+                break
+            wanted = reallocated(allocated, point_risks(step, engine.path(best.iterate)))
+            engine.widen(step.scaled(size_at_risk(wanted)))
+            other = engine.descend(best.iterate)
+            if other is None or not other.beats(best, 0.0):
+                break
+            gain, best, allocated = best.merit - other.merit, other, wanted
+            if gain <= _GAIN * best.merit:
+                break
+        engine.widen(step)
+        return replace(found, best=best)
+
+    def _rescue(
+        self, engine: Engine, step: StepData, last: Iterate | None, found: "_Found"
+    ) -> "_Found":
+        """Without a plan that meets every constraint: descend from one that does, if known."""
+        if found.best.status.ok:
+            return found
+        known = self._ladder.resort(step, last)
+        if not known.status.ok:
+            return replace(found, best=self._ladder.lesser(found.best, known))
+        better = engine.descend(known.iterate)
+        return replace(found, best=better if better and better.status.ok else known)
 
     def _plan(
-        self,
-        step: StepData,
-        best: Descent,
-        tried: tuple[Candidate, ...],
-        switched: bool,
-        watch: Stopwatch,
+        self, step: StepData, found: "_Found", watch: Stopwatch, qps: Mapping[str, int]
     ) -> Plan:
+        ending, best = watch.elapsed, found.best
         iterate, inside = best.iterate, watch.inside.seconds
-        timing = Timing(
-            linearise=watch.linearising.seconds,
-            update=watch.solving.seconds - inside,
-            solve=inside,
-            total=watch.elapsed,
-        )
-        qps = self._engine.finished
-        if self._condensed is not None and self._sparse.watch is watch:
-            qps = qps + self._sparse.finished
-        return Plan(
+        path = step.sampling.positions(iterate.states, iterate.inputs)
+        slack = step.sampling.stages(iterate.slack[: step.count]).max(axis=2, initial=0.0)
+        plan = Plan(
             X=iterate.states,
             U=iterate.inputs,
             s=iterate.s[: step.count],
-            slack=iterate.slack[: step.count],
+            slack=frozen(slack),
             cost=best.cost,
             status=best.status,
             kkt=best.residuals,
             iterations=best.iterations,
             qps=dict(qps),
-            candidates=tried,
-            switched=switched,
-            timing=timing,
+            candidates=found.tried,
+            switched=found.switched,
+            timing=Timing(
+                linearise=watch.linearising.seconds,
+                update=watch.solving.seconds - inside,
+                solve=inside,
+                total=watch.elapsed,
+            ),
             iterate=iterate,
+            commitment=partial(plan_risk, step, path),
         )
+        watch.learn("ending", ending)
+        return plan
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The best plan, the rivals that were tried, and whether one of them won."""
+
+    best: Descent
+    tried: tuple[Candidate, ...] = ()
+    switched: bool = False

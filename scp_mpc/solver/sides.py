@@ -9,11 +9,12 @@ present plan. For an obstacle that crosses, the two sides are before it and behi
 about the path gives half-spaces on that side, sound as any.
 
 Notation:
-    p       (N, d)      positions of the plan that ignores the obstacles
+    C                   points of the plan, K in each stage; K is not 1 between fast samples only
+    p       (C, d)      positions of the plan that ignores the obstacles
     v       (d,)        motion relative to the obstacle in one stage, over the conflict [m]
     n       (d,)        side: a unit vector square to v
     tau                 stages by which the candidate passes later (negative) or earlier
-    e       (N, d)      semi-axes s sigma + r; w and m are offset and n in units of them
+    e       (C, d)      semi-axes s sigma + r; w and m are offset and n in units of them
 """
 
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ class Side:
         obstacle: Its index.
         normal: (d,) from the obstacle to where the path passes.
         time: Stages by which it passes earlier than the free plan would.
-        path: (N, d) positions to linearise about.
+        path: (C, d) positions to linearise about.
     """
 
     obstacle: int
@@ -53,8 +54,8 @@ class Passing:
     """How a plan passes the obstacles.
 
     Attributes:
-        path: (N, d) its positions.
-        touched: (J, N) which obstacles push it, at which stages.
+        path: (C, d) its positions.
+        touched: (J, C) which obstacles push it, at which points.
     """
 
     path: FloatArray
@@ -66,8 +67,8 @@ def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatAr
 
     Args:
         step: The control step.
-        free: (N, d) positions of the plan that ignores the obstacles.
-        present: (N, d) positions of the best plan so far.
+        free: (C, d) positions of the plan that ignores the obstacles.
+        present: (C, d) positions of the best plan so far.
         s: (M,) sizes of the ellipsoids.
     """
     conflict = step.conflicts(free, s)
@@ -78,18 +79,21 @@ def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatAr
         side
         for j in order
         for side in _ways(
-            step, free, _elsewhere(free, present, conflict, j), float(s[j]), j, conflict[j]
+            step, free, _elsewhere(step, free, present, conflict, j), float(s[j]), j, conflict[j]
         )
     )
     return list(islice(ways, MAX_CANDIDATES))
 
 
-def _elsewhere(free: FloatArray, present: FloatArray, conflict: BoolArray, j: int) -> FloatArray:
+def _elsewhere(
+    step: StepData, free: FloatArray, present: FloatArray, conflict: BoolArray, j: int
+) -> FloatArray:
     """The free plan, and the present one during all conflicts but the first with obstacle j."""
+    reach = _AROUND * step.sampling.count
     others = conflict.copy()
-    others[j, _first_run(conflict[j])] = False
-    stages = np.flatnonzero(others.any(axis=0))
-    around = (stages[:, None] + np.arange(-_AROUND, _AROUND + 1)).clip(0, len(free) - 1)
+    others[j, _first_run(conflict[j], reach)] = False
+    points = np.flatnonzero(others.any(axis=0))
+    around = (points[:, None] + np.arange(-reach, reach + 1)).clip(0, len(free) - 1)
     path = free.copy()
     path[around] = present[around]
     return path
@@ -97,9 +101,12 @@ def _elsewhere(free: FloatArray, present: FloatArray, conflict: BoolArray, j: in
 
 def same_way(step: StepData, first: Passing, second: Passing) -> bool:
     """Whether two plans are pushed by the same obstacles at the same stages on the same side."""
-    if not np.array_equal(first.touched, second.touched):
+    K = step.sampling.count
+    mine, theirs = (step.sampling.stages(p.touched).any(axis=2) for p in (first, second))
+    if not np.array_equal(mine, theirs):
         return False
-    j, i = np.nonzero(first.touched)
+    j, i = np.nonzero(mine)
+    i = K * (i + 1) - 1  # the samples of those stages
     a, b = (passing.path[i] - step.means[j, i + 1] for passing in (first, second))
     apart = (a * b).sum(axis=1) < _COSINE * np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     return not apart.any()
@@ -113,9 +120,10 @@ def _ways(
     j: int,
     conflict: BoolArray,
 ) -> Iterator[Side]:
-    stages = _first_run(conflict)
-    v, normals = _directions(free - step.means[j, 1:], stages)
-    reach = slice(max(stages[0] - _AROUND, 0), stages[-1] + _AROUND + 1)
+    K, around = step.sampling.count, _AROUND * step.sampling.count
+    points = _first_run(conflict, around)
+    v, normals = _directions(free - step.means[j, 1:], points, K)
+    reach = slice(max(points[0] - around, 0), points[-1] + around + 1)
     ellipsoids = _Ellipsoids.of(step, s, j, reach)
     for time, push in _WAYS:
         for n in normals:
@@ -124,16 +132,18 @@ def _ways(
             yield Side(j, n, time, path)
 
 
-def _first_run(conflict: BoolArray) -> IntArray:
-    """Stages of the first conflict; gaps shorter than its surroundings do not end it."""
-    stages = np.flatnonzero(conflict)
-    gaps = np.flatnonzero(np.diff(stages) > _AROUND)
-    return stages[: gaps[0] + 1] if len(gaps) else stages
+def _first_run(conflict: BoolArray, around: int) -> IntArray:
+    """Points of the first conflict; gaps shorter than its surroundings do not end it."""
+    points = np.flatnonzero(conflict)
+    gaps = np.flatnonzero(np.diff(points) > around)
+    return points[: gaps[0] + 1] if len(gaps) else points
 
 
-def _directions(relative: FloatArray, stages: IntArray) -> tuple[FloatArray, list[FloatArray]]:
-    begin, end = max(stages[0] - 1, 0), min(stages[-1] + 1, len(relative) - 1)
-    v = (relative[end] - relative[begin]) / max(end - begin, 1)
+def _directions(
+    relative: FloatArray, points: IntArray, count: int
+) -> tuple[FloatArray, list[FloatArray]]:
+    begin, end = max(points[0] - count, 0), min(points[-1] + count, len(relative) - 1)
+    v = (relative[end] - relative[begin]) * (count / max(end - begin, 1))
     if np.linalg.norm(v) <= _STILL * np.linalg.norm(relative[begin]):
         v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
@@ -151,7 +161,8 @@ class _Ellipsoids:
     @classmethod
     def of(cls, step: StepData, s: float, j: int, reach: slice) -> "_Ellipsoids":
         variances, rotations = np.linalg.eigh(step.covariances[j, 1:][reach])
-        e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + step.radii[j], 1e-9)
+        radii = step.radii[j, reach, None]
+        e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + radii, 1e-9)
         return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
 
     def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:

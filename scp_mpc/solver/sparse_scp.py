@@ -22,13 +22,12 @@ from scp_mpc.settings import Settings
 from scp_mpc.solver.acceleration import Anderson
 from scp_mpc.solver.descent import Descent, Glimpse, hopeless, judge
 from scp_mpc.solver.iterate import Iterate, moved
-from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
+from scp_mpc.solver.sampling import Sampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 from scp_mpc.solver.subproblem import Subproblem
 from scp_mpc.solver.trusted import TrustedSolver
-from scp_mpc.trajectory import rollout
 
 
 class SparseSCP:
@@ -41,10 +40,11 @@ class SparseSCP:
         settings: How to solve it.
     """
 
-    def __init__(self, problem: Problem, settings: Settings) -> None:
+    def __init__(self, problem: Problem, settings: Settings, sampling: Sampling) -> None:
         """Lay out the subproblem and set up its solver."""
         self._problem, self._settings = problem, settings
-        self._subproblem = Subproblem(problem)
+        self._sampling = sampling
+        self._subproblem = Subproblem(problem, sampling)
         self._qp = TrustedSolver(self._subproblem.program, settings.qp)
         self._stale = False
         self.watch = Stopwatch()
@@ -67,6 +67,10 @@ class SparseSCP:
         self._qp.reset_counts()
         self._subproblem.write_step(step.x0, step.x_ref)
 
+    def widen(self, step: StepData) -> None:
+        """Take other radii or sizes for the step that has begun."""
+        self.step = step
+
     def unhindered(self) -> None:
         """No shortcut: see `CondensedSCP.unhindered`."""
 
@@ -75,28 +79,36 @@ class SparseSCP:
         self._subproblem.soft = False
         problem = self._problem
         self._subproblem.write_half_spaces(
-            HalfSpaces.none(problem.max_obstacles, problem.horizon, problem.model.dim)
+            HalfSpaces.none(problem.max_obstacles, self._sampling.points, problem.model.dim)
         )
         nominal = self._subproblem.resting(self.step.x_ref)
         return self._solve_convex(nominal, self._subproblem.residuals(nominal)) or nominal
 
     def free_path(self) -> FloatArray:
-        """Its positions (N, d)."""
-        return self.free().states[1:, self._problem.model.position]
+        """Its positions (C, d)."""
+        free = self.free()
+        return self._sampling.positions(free.states, free.inputs)
 
     def glimpses(
         self, best: Iterate, paths: Sequence[FloatArray], firm: bool = True
     ) -> list[Glimpse]:
-        """Solve one program about each path (N, d); see `CondensedSCP.glimpses`."""
-        position = self._problem.model.position
-        return [self._glimpse(self.descend(moved(best, position, path), 1), firm) for path in paths]
+        """Solve one program about each path (C, d); see `CondensedSCP.glimpses`."""
+        position, count = self._problem.model.position, self._sampling.count
+        starts = (moved(best, position, path[count - 1 :: count]) for path in paths)
+        return [self._glimpse(start, self.descend(start, 1), firm) for start in starts]
 
-    def _glimpse(self, end: Descent, firm: bool) -> Glimpse:
+    def _glimpse(self, start: Iterate, end: Descent | None, firm: bool) -> Glimpse:
+        if end is None:
+            path = self._sampling.positions(start.states, start.inputs)
+            nobody = np.zeros((self.step.count, len(path)), dtype=np.bool_)
+            return Glimpse(np.inf, nobody, path, lambda: start)
         merit = end.merit if end.status.ok or not firm else np.inf
-        return Glimpse(merit, end.iterate.touched[: self.step.count], end.make)
+        ended = end.iterate
+        path = self._sampling.positions(ended.states, ended.inputs)
+        return Glimpse(merit, ended.touched[: self.step.count], path, end.make)
 
-    def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent:
-        """Run the loop from one nominal plan, for at most `limit` subproblems.
+    def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
+        """Run the loop from one nominal plan, for at most `limit` subproblems; None if none came.
 
         Args:
             nominal: Where to begin.
@@ -109,9 +121,11 @@ class SparseSCP:
         residuals = self._linearise_about(iterate)
         acceleration = Anderson(iterate, self._problem.model.position)
         while residuals.worst > tolerance and iterations < limit:
-            if iterations and self.watch.overdue():
+            if not self.watch.affords("sparse program"):
                 break
+            began = self.watch.elapsed
             convex = self._improve(iterate, residuals, acceleration)
+            self.watch.learn("sparse program", began)
             if convex is None:
                 break
             iterate, iterations = convex, iterations + 1
@@ -121,9 +135,8 @@ class SparseSCP:
             if goal is not None and hopeless(iterations, self._merit(iterate), goal):
                 break
         if iterations == 0 and residuals.worst > tolerance:
-            return self._given_up(nominal)
-        status = judge(residuals, iterate.slack.max(initial=0.0), tolerance)
-        return self._ended(iterate, residuals, status, iterations)
+            return None
+        return self._ended(iterate, residuals, iterations)
 
     def _improve(
         self, iterate: Iterate, residuals: KKTResiduals, acceleration: Anderson
@@ -157,27 +170,16 @@ class SparseSCP:
 
     def _write_half_spaces(self, iterate: Iterate) -> None:
         with self.watch.linearising:
-            spaces = self.step.half_spaces(iterate.states, iterate.s)
+            spaces = self.step.half_spaces(iterate.states, iterate.s, iterate.inputs)
             self._subproblem.write_half_spaces(spaces)
-
-    def _given_up(self, nominal: Iterate) -> Descent:
-        """Keep the nominal inputs, roll them out from x0, and own up to what they violate."""
-        problem = self._problem
-        inputs = np.clip(nominal.inputs, problem.u_min, problem.u_max)
-        path = rollout(problem.model.step, self.step.x0, inputs)
-        s = np.full(problem.max_obstacles, problem.margin.reference)
-        value = self.step.half_spaces(path.states, s).value
-        iterate = Iterate(path.states, inputs, s, np.maximum(0.0, -value))
-        unknown = KKTResiduals(np.inf, np.inf, np.inf)
-        return self._ended(iterate, unknown, Status.FALLBACK, 0)
 
     def _ended(
         self,
         iterate: Iterate,
         residuals: KKTResiduals,
-        status: Status,
         iterations: int,
     ) -> Descent:
+        status = judge(residuals, iterate.slack.max(initial=0.0), self._settings.tolerance)
         cost = self._cost(iterate)
         merit = cost + self._penalty(iterate)
         return Descent(iterate.frozen, cost, merit, residuals, status, iterations)

@@ -1,39 +1,52 @@
-"""What one control step brings, checked before the solver is touched."""
+"""What one control step brings, checked before the solver is touched.
+
+Notation:
+    J, M    obstacles of this step, slots for them
+    C       points at which they are constrained: N stages, or K in each interval
+"""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import BoolArray, FloatArray, as_array
+from scp_mpc.arrays import BoolArray, FloatArray, as_array, require_positive_semidefinite
 from scp_mpc.errors import InvalidArgumentError, ShapeError, TooManyObstaclesError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
+from scp_mpc.safety.margin import Margin
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.solver.sampling import Sampling
 
 
 @dataclass(frozen=True, eq=False)
 class StepData:
-    """The validated state, reference and obstacles of one control step; J obstacles, M slots.
+    """The validated state, reference and obstacles of one control step.
 
     Attributes:
         problem: The problem to which they belong.
         x0: (nx,) state now.
         x_ref: (N+1, nx) reference, row 0 not weighted.
         obstacles: The J predictions.
-        means: (J, N+1, d) expected positions [m].
-        radii: (J,) robot radius + obstacle radius [m].
+        sampling: Where the plan is constrained.
+        means: (J, C+1, d) expected positions, row 0 now [m].
+        radii: (J, C) sums of the radii, or more where gaps between points ask for it [m].
+        robot_covariance: (N+1, d, d) of the robot's own position [m^2], or None.
+        scale: (J, C) what multiplies the standard deviations: sizes over s_ref; or None for one.
     """
 
     problem: Problem
     x0: FloatArray
     x_ref: FloatArray
     obstacles: tuple[ObstaclePrediction, ...]
+    sampling: Sampling
     means: FloatArray
     radii: FloatArray
+    robot_covariance: FloatArray | None = None
+    scale: FloatArray | None = None
 
     @classmethod
     def read(
@@ -42,8 +55,10 @@ class StepData:
         x0: ArrayLike,
         x_ref: ArrayLike,
         obstacles: Sequence[ObstaclePrediction],
+        robot_covariance: ArrayLike | None = None,
+        sampling: Sampling | None = None,
     ) -> "StepData":
-        """Check everything and stack the predictions.
+        """Check everything and stack the predictions, as they are at the samples.
 
         Raises:
             InvalidArgumentError: Or one of its subclasses, with the argument and the number.
@@ -68,9 +83,18 @@ class StepData:
                     f"obstacles[{j}].means",
                     f"shape {obstacle.means.shape} is not {(N + 1, model.dim)}",
                 )
+        uncertain = None
+        if robot_covariance is not None:
+            shape = (model.dim, model.dim)
+            uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
+            uncertain = np.broadcast_to(uncertain, (N + 1, *shape))
+            require_positive_semidefinite("robot_covariance", uncertain)
+        sampling = Sampling(model, N, 1) if sampling is None else sampling
         means = np.array([o.means for o in obstacles]).reshape(-1, N + 1, model.dim)
         radii = problem.robot_radius + np.array([o.radius for o in obstacles])
-        return cls(problem, state, reference, obstacles, means, radii)
+        radii = np.repeat(radii[:, None], N, axis=1)
+        step = cls(problem, state, reference, obstacles, sampling, means, radii, uncertain)
+        return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
 
     @property
     def count(self) -> int:
@@ -79,25 +103,37 @@ class StepData:
 
     @cached_property
     def covariances(self) -> FloatArray:
-        """(J, N+1, d, d) position covariances [m^2]."""
-        return np.array([o.covariances for o in self.obstacles])
+        """(J, C+1, d, d) covariances that the sizes s apply to [m^2]."""
+        covariances = np.array([o.covariances for o in self.obstacles])
+        if self.robot_covariance is not None:
+            covariances = covariances + self.robot_covariance
+        covariances = self.sampling.interpolated(covariances)
+        if self.scale is not None:
+            covariances = covariances.copy()
+            covariances[:, 1:] *= (self.scale * self.scale)[..., None, None]
+        return covariances
 
     @cached_property
     def spreads(self) -> FloatArray:
-        """(J, N+1) largest standard deviations [m]."""
-        return np.array([o.spread for o in self.obstacles])
+        """(J, C+1) bounds of the standard deviations in any direction [m]."""
+        spreads = np.array([o.spread for o in self.obstacles])
+        if self.robot_covariance is None and self.sampling.count == 1 and self.scale is None:
+            return spreads
+        variances = spreads * spreads
+        if self.robot_covariance is not None:
+            variances = variances + np.trace(self.robot_covariance, axis1=1, axis2=2)
+        spreads = np.sqrt(self.sampling.interpolated(variances))
+        if self.scale is not None:
+            spreads[:, 1:] *= self.scale
+        return spreads
 
     @cached_property
     def sets(self) -> NoGoSets:
-        """The obstacles' ellipsoids at stages 1 .. N, in all M slots."""
-        problem = self.problem
-        return NoGoSets.from_predictions(
-            self.obstacles,
-            problem.robot_radius,
-            problem.max_obstacles,
-            problem.horizon,
-            problem.model.dim,
-        )
+        """The obstacles' ellipsoids at all points, in all M slots."""
+        means, M = self.means[:, 1:], self.problem.max_obstacles
+        if not self.count:
+            return NoGoSets.stacked(means, np.zeros((*means.shape, means.shape[-1])), self.radii, M)
+        return NoGoSets.stacked(means, self.covariances[:, 1:], self.radii, M)
 
     @cached_property
     def start(self) -> FloatArray:
@@ -106,18 +142,54 @@ class StepData:
         start[: self.count] = self.x0[self.problem.model.position] - self.means[:, 0]
         return start
 
+    @cached_property
+    def track(self) -> FloatArray:
+        """(C+1, d) positions that the plan's deviations and inputs are added to [m]."""
+        model, states = self.problem.model, self.x_ref.copy()
+        states[0] = self.x0
+        track = np.empty((self.sampling.points + 1, model.dim))
+        track[0] = self.x0[model.position]
+        track[1:] = self.sampling.positions(states, np.zeros((len(states) - 1, model.nu)))
+        return track
+
     def path(self, deviations: FloatArray) -> FloatArray:
-        """Positions (N+1, d) [m] from now on, given their deviations (N d,) from the reference."""
-        position = self.problem.model.position
-        path = self.x_ref[:, position]
-        path[0] = self.x0[position]
-        path[1:] += deviations.reshape(-1, len(position))
+        """Positions (C+1, d) [m] from now on, given their deviations (C d,) from the track."""
+        path = self.track.copy()
+        path[1:] += deviations.reshape(-1, path.shape[1])
         return path
 
-    def half_spaces(self, states: FloatArray, s: FloatArray) -> HalfSpaces:
-        """Linearise the obstacles' constraints about states (N+1, nx) and sizes s (M,)."""
-        positions = states[1:, self.problem.model.position]
+    def half_spaces(
+        self, states: FloatArray, s: FloatArray, inputs: FloatArray | None = None
+    ) -> HalfSpaces:
+        """Linearise the constraints about states (N+1, nx), inputs (N, nu) and sizes s (M,).
+
+        Inputs matter between the samples only; None stands for zero.
+        """
+        if inputs is None:
+            inputs = np.zeros((len(states) - 1, self.problem.model.nu))
+        positions = self.sampling.positions(states, inputs)
         return self.problem.no_go.linearise(self.sets, positions, s, self.start)
+
+    def scaled_uniformly(self) -> "StepData":
+        """The same with sizes as they are where all points are promised the same."""
+        size = self.problem.size_for(self.count, self.sampling.count)
+        scale = size / self.problem.size.reference
+        return replace(self, scale=None if scale == 1 else np.full(self.radii.shape, scale))
+
+    def scaled(self, sizes: FloatArray) -> "StepData":
+        """The same with sizes (J, C) of their own at all points."""
+        return replace(self, scale=sizes / self.problem.size.reference)
+
+    def unscaled(self) -> "StepData":
+        """The same with covariances as they were predicted."""
+        return self if self.scale is None else replace(self, scale=None)
+
+    def sampled(self, sampling: Sampling) -> "StepData":
+        """The same with predictions at other points; coarse to fine only."""
+        means = sampling.interpolated(self.means)
+        radii = np.repeat(self.radii, sampling.count, axis=1)
+        step = replace(self, sampling=sampling, means=means, radii=radii, scale=None)
+        return step if isinstance(self.problem.margin, Margin) else step.scaled_uniformly()
 
     def within(
         self,
@@ -126,23 +198,23 @@ class StepData:
         distance: float,
         known: BoolArray | None = None,
     ) -> BoolArray | None:
-        """Which obstacles may be nearer than a distance, (J, N) for stages 1 .. N; None for none.
+        """Which obstacles may be nearer than a distance, (J, C) for points 1 .. C; None for none.
 
         The direction n from the mean to p gives a lower bound of the signed distance to the
         s-sigma ellipsoid, n'(p - mu) - s sqrt(n' Sigma n), and n' Sigma n is at most the largest
         variance. Who is clear by these bounds is clear of either inflation's no-go set.
 
         Args:
-            positions: (N+1, d) of the robot [m].
+            positions: (C+1, d) of the robot [m].
             s: (M,) sizes of the ellipsoids.
             distance: Beyond the radii [m].
-            known: (J, N) pairs that need no answer.
+            known: (J, C) pairs that need no answer.
         """
         if not self.obstacles:
             return None
         y = positions[1:] - self.means[:, 1:]
         length2 = np.add.reduce(y * y, axis=2)
-        reach = (self.radii + distance)[:, None]
+        reach = self.radii + distance
         size = s[: self.count, None]
         least = size * self.spreads[:, 1:] + reach
         unclear = length2 <= least * least
@@ -162,15 +234,21 @@ class StepData:
         unclear[unclear] = close
         return unclear
 
-    def conflicts(self, path: FloatArray, s: FloatArray) -> BoolArray:
-        """Which no-go sets a path (N, d) enters at sizes s (M,): (J, N)."""
+    def depths(self, path: FloatArray, s: FloatArray) -> FloatArray:
+        """How deep a path (C, d) enters the no-go sets at sizes s (M,): (J, C) [m]."""
         now = self.x0[self.problem.model.position]
-        inside = np.zeros((self.count, self.problem.horizon), dtype=np.bool_)
+        depths = np.zeros((self.count, len(path)))
         near = self.within(np.concatenate([now[None], path]), s, 0.0)
         if near is not None:
             j, i = np.nonzero(near)
-            sets = NoGoSets.pairs(self.means[j, i + 1], self.covariances[j, i + 1], self.radii[j])
+            covariances = self.covariances[j, i + 1]
+            sets = NoGoSets.pairs(self.means[j, i + 1], covariances, self.radii[j, i])
             before = path[i - 1] - self.means[j, i]
             g = self.problem.no_go.linearise(sets, path[i][:, None], s[j], before).value
-            inside[j, i] = g[:, 0] < 0
+            depths[j, i] = np.maximum(0.0, -g[:, 0])
+        return depths
+
+    def conflicts(self, path: FloatArray, s: FloatArray) -> BoolArray:
+        """Which no-go sets a path (C, d) enters at sizes s (M,): (J, C)."""
+        inside: BoolArray = self.depths(path, s) > 0
         return inside

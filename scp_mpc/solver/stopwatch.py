@@ -1,8 +1,11 @@
-"""Where the time of one control step goes."""
+"""Where the time of one control step goes, and whether what comes next still fits in."""
 
 from math import inf
 from time import perf_counter
 from types import TracebackType
+
+_FORGET = 0.02  # of the difference to a shorter time, each time it is measured
+_EASE = 0.9  # of a time, each time that it stood in the way: or one hiccup would do so for ever
 
 
 class Lap:
@@ -28,11 +31,37 @@ class Lap:
         self.seconds += perf_counter() - self._began
 
 
+class Pace:
+    """How long tasks took lately: their longest times, slowly forgotten.
+
+    One serves all steps of a controller, so that the first iteration of a step is predicted from
+    those of earlier steps.
+    """
+
+    def __init__(self) -> None:
+        """Know nothing: everything is expected to take no time."""
+        self._seconds: dict[str, float] = {}
+
+    def expected(self, task: str) -> float:
+        """Predicted seconds."""
+        return self._seconds.get(task, 0.0)
+
+    def learn(self, task: str, seconds: float) -> None:
+        """Take note of a measured time."""
+        known = self.expected(task)
+        self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
+
+    def ease(self, task: str) -> None:
+        """Expect a little less, after a task was not begun."""
+        self._seconds[task] = _EASE * self.expected(task)
+
+
 class Stopwatch:
     """Laps of one control step, and its deadline.
 
     Args:
-        deadline: Seconds after which the step is overdue; None for never.
+        deadline: Seconds after which the step is late; None for never.
+        pace: Times of earlier steps.
 
     Attributes:
         linearising: Geometry of the obstacles.
@@ -40,9 +69,10 @@ class Stopwatch:
         inside: The part of `solving` spent in the QP solvers themselves.
     """
 
-    def __init__(self, deadline: float | None = None) -> None:
+    def __init__(self, deadline: float | None = None, pace: Pace | None = None) -> None:
         """Begin the step."""
         self._deadline = inf if deadline is None else deadline
+        self._pace = Pace() if pace is None else pace
         self.linearising, self.solving, self.inside = Lap(), Lap(), Lap()
         self._began = perf_counter()
 
@@ -51,6 +81,26 @@ class Stopwatch:
         """Seconds since the step began."""
         return perf_counter() - self._began
 
-    def overdue(self, share: float = 1.0) -> bool:
-        """Whether that share of the time is gone."""
-        return self.elapsed > share * self._deadline
+    @property
+    def deadline(self) -> float:
+        """When the step is late, as a time of `perf_counter`."""
+        return self._began + self._deadline
+
+    @property
+    def remaining(self) -> float:
+        """Seconds until the deadline, negative after it; infinite without one."""
+        return self._deadline - self.elapsed
+
+    def affords(self, task: str) -> bool:
+        """Whether a task, and what ends the step, are predicted to end before the deadline."""
+        if self._deadline == inf:
+            return True
+        if self._pace.expected(task) + self._pace.expected("ending") <= self.remaining:
+            return True
+        self._pace.ease(task)
+        return False
+
+    def learn(self, task: str, since: float) -> None:
+        """Note that a task took from `since`, in seconds `elapsed`, until now."""
+        if self._deadline < inf:
+            self._pace.learn(task, self.elapsed - since)

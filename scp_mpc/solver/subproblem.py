@@ -2,12 +2,13 @@
 
 Notation:
     e_i = x_i - xref_i      deviation from the reference, so that no number depends on the origin
-    z = [e_1 .. e_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MN]
+    C                       points at which obstacles are constrained, K in each interval
+    z = [e_1 .. e_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MC]
     rows = [dynamics | input bounds | bounds on s | half-spaces | slack]
 
     dynamics        e_{i+1} - A e_i - B u_i = A xref_i - xref_{i+1}, with A x_0 for A (e_0 + xref_0)
-    half-spaces     normal_ji' e_i[position] + slope_ji s_j + slack_ji
-                        >= offset_ji - normal_ji' xref_i[position]
+    half-spaces     normal_jc' p_c + slope_jc s_j + slack_jc >= offset_jc - normal_jc' track_c
+                        with p_c = e_i[position] at the samples, else C_k e_i + D_k u_i
     slack           slack = 0 (firm) or slack >= 0 at `slack_weight` per metre (soft)
 
 OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
@@ -23,6 +24,7 @@ from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
+from scp_mpc.solver.sampling import Sampling
 from scp_mpc.solver.sparse_blocks import SparseBlocks
 
 
@@ -35,12 +37,14 @@ class Subproblem:
     `program` then holds the values, and `unpack` turns its solution into an `Iterate`.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, sampling: Sampling | None = None) -> None:
         """Lay out variables and rows and write the constant values."""
         self._problem = problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        columns = [N * model.nx, N * model.nu, M, M * N]
-        rows = [N * model.nx, N * model.nu, M, M * N, M * N]
+        self._sampling = Sampling(model, N, 1) if sampling is None else sampling
+        C = self._sampling.points
+        columns = [N * model.nx, N * model.nu, M, M * C]
+        rows = [N * model.nx, N * model.nu, M, M * C, M * C]
         self._x, self._u, self._s, self._slack = _slices(columns)
         self._dynamics, self._inputs, self._margin, self._spaces, self._pins = _slices(rows)
         n, m = sum(columns), sum(rows)
@@ -51,9 +55,9 @@ class Subproblem:
         lower, upper = self.program.lower, self.program.upper
         lower[self._inputs] = np.tile(problem.u_min, N)
         upper[self._inputs] = np.tile(problem.u_max, N)
-        lower[self._margin], upper[self._margin] = problem.margin.lower, problem.margin.upper
+        lower[self._margin], upper[self._margin] = problem.size.lower, problem.size.upper
         lower[self._pins] = 0.0
-        self.program.q[self._s] = -2 * problem.margin.weight * problem.margin.reference
+        self.program.q[self._s] = -2 * problem.size.weight * problem.size.reference
         self._x0 = np.zeros(model.nx)
         self._reference = np.zeros((N, model.nx))
         self.write_step(self._x0, np.zeros((N + 1, model.nx)))
@@ -76,15 +80,23 @@ class Subproblem:
         before = np.concatenate([x0[None], x_ref[1:-1]])
         drift = before @ self._problem.model.A.T - x_ref[1:]
         self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = drift.ravel()
+        model = self._problem.model
+        still = np.zeros((len(before), model.nu))
+        self._track = self._sampling.positions(np.concatenate([before, x_ref[-1:]]), still)
 
     def write_half_spaces(self, spaces: HalfSpaces) -> None:
         """Write normals, slopes and offsets into the rows of the half-spaces."""
+        problem, K, d = self._problem, self._sampling.count, self._problem.model.dim
         data = self.program.A.data
-        data[self._places["normals"]] = spaces.normal.ravel()
+        normal = spaces.normal.reshape(problem.max_obstacles, problem.horizon, K, d)
+        data[self._places["normals"]] = normal[:, :, -1].ravel()
         data[self._places["slopes"]] = spaces.slope.ravel()
-        along = np.einsum(
-            "mnd,nd->mn", spaces.normal, self._reference[:, self._problem.model.position]
-        )
+        if K > 1:
+            inner = normal[:, :, :-1, None]
+            C, D = (m.reshape(K - 1, d, m.shape[1]) for m in (self._sampling.C, self._sampling.D))
+            data[self._places["along states"]] = (inner[:, 1:] @ C)[..., 0, :].ravel()
+            data[self._places["along inputs"]] = (inner @ D)[..., 0, :].ravel()
+        along = np.einsum("mnd,nd->mn", spaces.normal, self._track)
         self.program.lower[self._spaces] = (spaces.offset - along).ravel()
 
     def pack(self, iterate: Iterate) -> tuple[FloatArray, FloatArray]:
@@ -106,19 +118,20 @@ class Subproblem:
     def unpack(self, z: FloatArray, y: FloatArray) -> Iterate:
         """Name the parts of z and y; inputs and sizes are clipped to their bounds."""
         problem = self._problem
-        N, M, model = problem.horizon, problem.max_obstacles, problem.model
+        N, model = problem.horizon, problem.model
+        slots = problem.max_obstacles, self._sampling.points
         y.setflags(write=False)
         return Iterate(
             np.concatenate([self._x0[None], self._reference + z[self._x].reshape(N, model.nx)]),
             np.clip(z[self._u].reshape(N, model.nu), problem.u_min, problem.u_max),
-            np.clip(z[self._s], problem.margin.lower, problem.margin.upper),
-            np.maximum(z[self._slack].reshape(M, N), 0.0),
+            np.clip(z[self._s], problem.size.lower, problem.size.upper),
+            np.maximum(z[self._slack].reshape(slots), 0.0),
             Multipliers(
                 y[self._dynamics].reshape(N, model.nx),
                 y[self._inputs].reshape(N, model.nu),
                 y[self._margin],
-                y[self._spaces].reshape(M, N),
-                y[self._pins].reshape(M, N),
+                y[self._spaces].reshape(slots),
+                y[self._pins].reshape(slots),
             ),
         )
 
@@ -140,16 +153,17 @@ class Subproblem:
         """An iterate with the given states (N+1, nx), no input, s = s_ref and no slack."""
         problem = self._problem
         N, M = problem.horizon, problem.max_obstacles
-        s = np.full(M, problem.margin.reference)
-        return Iterate(states, np.zeros((N, problem.model.nu)), s, np.zeros((M, N)))
+        s = np.full(M, problem.size.reference)
+        slack = np.zeros((M, self._sampling.points))
+        return Iterate(states, np.zeros((N, problem.model.nu)), s, slack)
 
     def _hessian(self) -> sparse.csc_matrix:
         problem = self._problem
         N, M = problem.horizon, problem.max_obstacles
         weights = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
         blocks = [sparse.csc_matrix(2 * block) for block in weights]  # without the blocks' zeros
-        blocks.append(2 * problem.margin.weight * sparse.eye(M, format="csc"))
-        blocks.append(sparse.csc_matrix((M * N, M * N)))
+        blocks.append(2 * problem.size.weight * sparse.eye(M, format="csc"))
+        blocks.append(sparse.csc_matrix((M * self._sampling.points,) * 2))
         return sparse.csc_matrix(sparse.block_diag(blocks, format="csc"))
 
     def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict[str, IntArray]]:
@@ -171,10 +185,14 @@ class Subproblem:
             ("slack", self._spaces, self._slack),
         ):
             blocks.add(name, np.arange(rows.start, rows.stop), _range(columns), 1.0)
-        space = self._spaces.start + np.arange(M * N).reshape(M, N, 1)
+        K = self._sampling.count
+        space = self._spaces.start + np.arange(M * N * K).reshape(M, N, K, 1)
         position = self._x.start + np.arange(N)[:, None] * model.nx + model.position
-        blocks.add("normals", space, np.broadcast_to(position, (M, N, d)), 0.0)
-        blocks.add("slopes", space[..., 0], self._s.start + np.arange(M)[:, None], 0.0)
+        blocks.add("normals", space[:, :, -1], np.broadcast_to(position, (M, N, d)), 0.0)
+        blocks.add("slopes", space[..., 0], self._s.start + np.arange(M)[:, None, None], 0.0)
+        if K > 1:
+            blocks.add("along states", space[:, 1:, :-1], state[:-1], 0.0)
+            blocks.add("along inputs", space[:, :, :-1], control, 0.0)
         return blocks.build(shape)
 
 

@@ -1,0 +1,48 @@
+"""The risk that a plan commits to, for the predictions it was made with.
+
+Notation:
+    J, N, C     obstacles, stages, points: K in each stage
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.risk import risk_bound
+from scp_mpc.solver.step_data import StepData
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRisk:
+    """Upper bounds of the probability that the robot touches an obstacle if it follows the plan.
+
+    They hold for the Gaussians that were predicted, with Boole's inequality over points, stages
+    and obstacles, and whatever the correlation between them.
+
+    Attributes:
+        stages: (J, N) of touching obstacle j between samples i - 1 and i.
+        obstacles: (J,) of touching obstacle j at all.
+        joint: Of touching any.
+    """
+
+    stages: FloatArray
+    obstacles: FloatArray
+    joint: float
+
+
+def point_risks(step: StepData, path: FloatArray) -> FloatArray:
+    """Half-space bounds (J, C) along a path (C, d), for the covariances as predicted."""
+    if not step.count:
+        return np.zeros((0, step.sampling.points))
+    plain = step.unscaled()
+    sets = NoGoSets.stacked(plain.means[:, 1:], plain.covariances[:, 1:], plain.radii, plain.count)
+    return risk_bound(sets, path)
+
+
+def plan_risk(step: StepData, path: FloatArray) -> PlanRisk:
+    """Add the bounds up."""
+    stages = step.sampling.stages(point_risks(step, path)).sum(axis=2)
+    whole = stages.sum(axis=1)
+    return PlanRisk(np.minimum(stages, 1.0), np.minimum(whole, 1.0), min(1.0, float(whole.sum())))

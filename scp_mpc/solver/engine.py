@@ -1,0 +1,135 @@
+"""The two ways to descend, as one: the condensed problem, and the sparse one behind it."""
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property
+from math import inf
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
+from scp_mpc.solver.condensed_scp import CondensedSCP
+from scp_mpc.solver.descent import Descent, Glimpse
+from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.plan import Status
+from scp_mpc.solver.sampling import Sampling
+from scp_mpc.solver.sparse_scp import SparseSCP
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.solver.sweep import Sweep
+
+
+class Engine:
+    """Solves control steps with so many points in each interval.
+
+    Usage: `begin` a step; then everything else as often as wanted.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+        count: Points in each interval, K.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings, count: int) -> None:
+        """Condense the problem, if it can be."""
+        self._problem, self._settings = problem, settings
+        self.sampling = Sampling(problem.model, problem.horizon, count)
+        self._condensed = (
+            CondensedSCP.of(problem, settings, self.sampling) if settings.condense else None
+        )
+        self._fresh = False
+
+    @cached_property
+    def sparse(self) -> SparseSCP:
+        """The sparse problem, laid out when it is first asked for."""
+        return SparseSCP(self._problem, self._settings, self.sampling)
+
+    @property
+    def primary(self) -> CondensedSCP | SparseSCP:
+        """Who is asked first."""
+        return self._condensed or self.sparse
+
+    @property
+    def condenses(self) -> bool:
+        """Whether that is the condensed problem."""
+        return self._condensed is not None
+
+    @property
+    def finished(self) -> Counter[str]:
+        """Programs solved since `begin`, by solver."""
+        if self._fresh or self._condensed is None:
+            return self.primary.finished
+        return self.primary.finished + self.sparse.finished
+
+    def begin(self, step: StepData, watch: Stopwatch) -> None:
+        """Read a control step."""
+        self._step, self._watch, self._fresh = step, watch, True
+        self.primary.begin(step, watch)
+
+    def widen(self, step: StepData) -> None:
+        """Take other radii or sizes for the step that has begun."""
+        self._step = step
+        self.primary.widen(step)
+        self._fresh = True
+
+    def forget(self) -> None:
+        """Forget what earlier programs left behind."""
+        if "sparse" in self.__dict__:
+            self.sparse.forget()
+
+    def path(self, iterate: Iterate) -> FloatArray:
+        """Positions (C, d) of an iterate."""
+        return self.sampling.positions(iterate.states, iterate.inputs)
+
+    def sweep(self, iterate: Iterate) -> Sweep:
+        """What an iterate does between its points."""
+        return Sweep.of(np.concatenate([self._step.track[:1], self.path(iterate)]))
+
+    def free_sweep(self) -> Sweep:
+        """What the plan that ignores the obstacles does between its points."""
+        return Sweep.of(np.concatenate([self._step.track[:1], self.free_path()]))
+
+    def unhindered(self) -> Descent | None:
+        """See `CondensedSCP.unhindered`."""
+        return self.primary.unhindered()
+
+    def free(self) -> Iterate:
+        """The plan that ignores the obstacles, which may not be clear of them."""
+        return self.primary.free()
+
+    def free_path(self) -> FloatArray:
+        """Its positions (C, d)."""
+        return self.primary.free_path()
+
+    def glimpses(self, best: Iterate, paths: Sequence[FloatArray], firm: bool) -> list[Glimpse]:
+        """See `CondensedSCP.glimpses`."""
+        return self.primary.glimpses(best, paths, firm)
+
+    def follow(self, start: Iterate, goal: Descent) -> Descent | None:
+        """Descend from a rival's start; None where it is plain that it will not reach the goal."""
+        return self.primary.descend(start, self._settings.max_iterations, goal)
+
+    def descend(self, nominal: Iterate) -> Descent | None:
+        """Descend on the condensed problem; on the sparse one where that has no answer.
+
+        None if not even the first program was solved, or there was no time for it.
+        """
+        limit = self._settings.max_iterations
+        if self._condensed is None:
+            return self.sparse.descend(nominal, limit)
+        best = self._condensed.descend(nominal, limit)
+        if best is not None and best.status is not Status.VIOLATING:
+            return best
+        hurried = self._watch.deadline < inf and "sparse" not in self.__dict__
+        tasks = "program", "sparse program"
+        if hurried or not all(self._watch.affords(task) for task in tasks):
+            return best
+        if self._fresh:
+            self.sparse.begin(self._step, self._watch)
+            self._fresh = False
+        other = self.sparse.descend(nominal, limit)
+        if best is None or other is None:
+            return best or other
+        return other if other.beats(best, lead=0.0) else best

@@ -1,0 +1,100 @@
+"""How finely a control step is resolved in time: samples alone, or points between them, too.
+
+Samples alone where the problem says so, and where the robot's and the obstacles' ways from one
+sample to the next are within the radii. In either case but the first the radii grow by what
+happens between two points (`sweep.py`).
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
+from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.engine import Engine
+from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.plan import Status
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.solver.sweep import Sweep, swept, too_fast
+
+
+class Resolution:
+    """The engines for both, and the choice between them.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+
+    Attributes:
+        coarse: Samples alone.
+        fine: Points between them, too; the same as `coarse` where the problem wants none.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings) -> None:
+        """Set both engines up."""
+        self.coarse = self.fine = Engine(problem, settings, 1)
+        self.coarse.sparse  # noqa: B018 - laid out now, not in the first step that needs it
+        self._tolerance = settings.tolerance
+        self._covers_gaps = problem.subsamples > 1
+        if self._covers_gaps:
+            self.fine = Engine(problem, settings, problem.subsamples)
+
+    def forget(self) -> None:
+        """Forget what earlier programs left behind."""
+        self.coarse.forget()
+        self.fine.forget()
+
+    def begin(self, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData, Descent | None]:
+        """Choose the engine and begin the step; the third is the free plan, if that is clear."""
+        engine = self.coarse
+        engine.begin(step, watch)
+        if not self._covers_gaps or not step.count:
+            return engine, step, engine.unhindered()
+        sweep = engine.free_sweep()
+        wide = self.widened(engine, step, sweep)
+        best = engine.unhindered()
+        if best is None and too_fast(step, sweep):
+            engine, step = self.fine, step.sampled(self.fine.sampling)
+            engine.begin(step, watch)
+            wide = self.widened(engine, step, engine.free_sweep())
+            best = engine.unhindered()
+        return engine, step if best is None else wide, best
+
+    def finished(self, engine: Engine) -> Counter[str]:
+        """Programs solved in this control step, which ended with this engine."""
+        return self.coarse.finished + (Counter() if engine is self.coarse else engine.finished)
+
+    def assumed(self, engine: Engine, start: Iterate) -> Sweep | None:
+        """What the plan is assumed to do between two points; None where that does not matter."""
+        if not self._covers_gaps:
+            return None
+        return engine.free_sweep().and_more(engine.sweep(start))
+
+    def widened(self, engine: Engine, step: StepData, sweep: Sweep | None) -> StepData:
+        """Let an engine take the radii that this needs."""
+        wide = step if sweep is None else swept(step, sweep)
+        engine.widen(wide)
+        return wide
+
+    def kept(self, engine: Engine, step: StepData, sweep: Sweep | None, best: Descent) -> bool:
+        """Whether a plan is clear between its points, too, for what it really does there."""
+        if sweep is None or not best.status.ok:
+            return True
+        moved = engine.sweep(best.iterate)
+        if sweep.covers(moved):
+            return True
+        depths = swept(step, moved).depths(engine.path(best.iterate), best.iterate.s)
+        return bool(depths.max(initial=0.0) <= self._tolerance)
+
+    def corrected(self, engine: Engine, sweep: Sweep | None, best: Descent) -> Sweep | None:
+        """What to assume after a plan that was not kept."""
+        return None if sweep is None else engine.sweep(best.iterate).and_more(sweep)
+
+
+def exposed(best: Descent) -> Descent:
+    """A plan that is not clear between its points after all."""
+    residuals = replace(best.residuals, feasibility=np.inf)
+    return replace(best, status=Status.VIOLATING, residuals=residuals)
