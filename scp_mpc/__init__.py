@@ -11,6 +11,7 @@ from scp_mpc.errors import (
     NotFiniteError,
     ScpMpcError,
     ShapeError,
+    StaleDataError,
     TooManyObstaclesError,
 )
 from scp_mpc.obstacles import (
@@ -22,7 +23,7 @@ from scp_mpc.obstacles import (
 from scp_mpc.problem import Problem
 from scp_mpc.robots import DoubleIntegrator, LinearModel
 from scp_mpc.safety import Containment, JointRisk, Margin, StageRisk
-from scp_mpc.settings import QPSettings, Settings
+from scp_mpc.settings import Freshness, QPSettings, Settings
 from scp_mpc.solver import SCP, Iterate, Plan, Status
 from scp_mpc.trajectory import Trajectory
 
@@ -39,6 +40,7 @@ __all__ = [
     "Containment",
     "CovarianceError",
     "DoubleIntegrator",
+    "Freshness",
     "InvalidArgumentError",
     "Iterate",
     "JointRisk",
@@ -54,6 +56,7 @@ __all__ = [
     "Settings",
     "ShapeError",
     "StageRisk",
+    "StaleDataError",
     "Status",
     "TooManyObstaclesError",
     "Trajectory",

@@ -85,6 +85,8 @@ def as_number(argument: str, value: Any) -> float:
     Raises:
         InvalidArgumentError: It is not one number, or not finite.
     """
+    if type(value) is float and -_LARGEST <= value <= _LARGEST:
+        return value
     return float(as_array(argument, value, ()))
 
 

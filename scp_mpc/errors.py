@@ -49,3 +49,7 @@ class ConcurrentUseError(ScpMpcError):
 
 class TooManyObstaclesError(InvalidArgumentError):
     """More obstacles were passed than `Problem.max_obstacles` provides for."""
+
+
+class StaleDataError(InvalidArgumentError):
+    """A time cannot be worked with: data too old, a stamp missing, a clock that is wrong."""

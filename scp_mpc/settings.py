@@ -1,6 +1,7 @@
-"""Settings of the solver: how it works, never what problem it solves."""
+"""Settings of solver and controller: how they work, never what problem they solve."""
 
 from dataclasses import dataclass, field
+from typing import Literal, get_args, get_type_hints
 
 from scp_mpc.arrays import as_count, as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
@@ -40,6 +41,45 @@ class QPSettings:
 
 
 @dataclass(frozen=True)
+class Freshness:
+    """How old a prediction may be, and what the controller does about it.
+
+    Attributes:
+        grow_after: Age [s] up to which a prediction is used as it is; an older one is moved on
+            along itself and grown.
+        stop_after: Age [s] beyond which a prediction is not used any more; see `beyond`.
+        keep: Seconds for which a named obstacle is kept, moved on and grown, after it was last
+            reported; 0 drops it at once.
+        growth: Variance [m^2] that each second of age adds in every direction.
+        beyond: What to do with predictions older than `stop_after`: "brake" returns a plan that
+            brakes, "refuse" raises `StaleDataError`.
+        stamps: "required" refuses a step without a time and a prediction without a stamp;
+            "optional" takes such a prediction for one of now.
+    """
+
+    grow_after: float = 0.05
+    stop_after: float = 1.0
+    keep: float = 1.0
+    growth: float = 0.1
+    beyond: Literal["brake", "refuse"] = "brake"
+    stamps: Literal["optional", "required"] = "optional"
+
+    def __post_init__(self) -> None:
+        """Check every number and word."""
+        for name in ("grow_after", "stop_after", "keep", "growth"):
+            if as_number(f"freshness.{name}", getattr(self, name)) < 0:
+                raise BoundsError(f"freshness.{name}", f"{getattr(self, name)} is negative")
+        if self.stop_after < self.grow_after:
+            raise BoundsError("freshness.stop_after", f"{self.stop_after} s is before grow_after")
+        for name in ("beyond", "stamps"):
+            words = get_args(get_type_hints(Freshness)[name])
+            if getattr(self, name) not in words:
+                raise InvalidArgumentError(
+                    f"freshness.{name}", f"{getattr(self, name)!r} is none of {', '.join(words)}"
+                )
+
+
+@dataclass(frozen=True)
 class Settings:
     """Settings of the sequential convex programming.
 
@@ -57,6 +97,7 @@ class Settings:
         deadline: Seconds after which no iteration is begun once there is a plan; other sides are
             left out when half of them are gone. None: take the time it takes.
         qp: Settings of the quadratic program's solvers.
+        freshness: How old predictions may be; for the controller `MPC` alone.
     """
 
     tolerance: float = 1e-6
@@ -68,6 +109,7 @@ class Settings:
     rivals: int = 1
     deadline: float | None = None
     qp: QPSettings = field(default_factory=QPSettings)
+    freshness: Freshness = field(default_factory=Freshness)
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -80,6 +122,8 @@ class Settings:
         require_flags(self, "condense", "acceleration", "sides")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
+        if not isinstance(self.freshness, Freshness):
+            raise InvalidArgumentError("freshness", f"{self.freshness!r} is not a Freshness")
         if self.qp.accuracy > self.tolerance:
             raise BoundsError(
                 "qp.accuracy",
