@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from instances import obstacle
 
 from scp_mpc import BoundsError, InvalidArgumentError, NotFiniteError, ObstaclePrediction
-from scp_mpc.obstacles.ageing import aged
+from scp_mpc.obstacles import aged
 
 DT = 0.2
 

@@ -1,5 +1,6 @@
 """Obstacles: their predicted Gaussians, the predictors, and the report's obstacle."""
 
+from scp_mpc.obstacles.ageing import aged
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor, Predictor, ReportPredictor
@@ -10,4 +11,5 @@ __all__ = [
     "ObstaclePrediction",
     "Predictor",
     "ReportPredictor",
+    "aged",
 ]
