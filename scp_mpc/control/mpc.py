@@ -1,15 +1,33 @@
-"""Model predictive control: the solver with a memory of its last plan."""
+"""Model predictive control: the solver with a memory of its last plan and of the obstacles.
 
+what is known of the obstacles now: reports brought up to the present, vanished ones kept
+nominal = previous plan, shifted
+plan = SCP (or braking, where a report is too old)
+u0 within its bounds, checked last; only then is anything remembered
+"""
+
+import logging
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from threading import Lock
+from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from scp_mpc.arrays import frozen
+from scp_mpc.control.memory import ObstacleMemory, Recall
+from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.plan import Plan
+from scp_mpc.solver.plan import Plan, Status
 from scp_mpc.solver.scp import SCP
+from scp_mpc.solver.step_data import StepData
+
+_log = logging.getLogger(__name__)
 
 
 class MPC:
@@ -18,13 +36,28 @@ class MPC:
     Args:
         problem: What to solve at each step.
         settings: How to solve it.
+
+    Attributes:
+        overruns: Steps whose plan took longer than `settings.deadline`, since `reset`.
     """
 
     def __init__(self, problem: Problem, settings: Settings | None = None) -> None:
         """Set up the solver; there is no plan yet."""
         self._solver = SCP(problem, settings)
+        self._memory = ObstacleMemory(
+            self.settings.freshness, problem.model.dt, problem.max_obstacles
+        )
+        self._busy = Lock()
+        self._counts: Counter[Status] = Counter()
+        self._forget()
+
+    def _forget(self) -> None:
         self._last: Iterate | None = None
         self._steps_touching = 0
+        self._obstacles: tuple[ObstaclePrediction, ...] = ()
+        self._counts.clear()
+        self.overruns = 0
+        self._memory.reset()
 
     @property
     def problem(self) -> Problem:
@@ -36,6 +69,19 @@ class MPC:
         """The solver's settings."""
         return self._solver.settings
 
+    @property
+    def counts(self) -> Counter[Status]:
+        """How many steps ended in which status, since `reset`."""
+        return self._counts.copy()
+
+    @property
+    def obstacles(self) -> tuple[ObstaclePrediction, ...]:
+        """What the last plan was made with: the predictions given, as of then, then those kept.
+
+        `plan.s` and `plan.slack` are in this order.
+        """
+        return self._obstacles
+
     def nominal(self) -> Iterate | None:
         """The guess from which the next step starts; None before the first step."""
         return None if self._last is None else self._shifted()
@@ -45,29 +91,89 @@ class MPC:
         x0: ArrayLike,
         x_ref: ArrayLike,
         obstacles: Sequence[ObstaclePrediction] = (),
+        *,
+        time: float | None = None,
+        robot_covariance: ArrayLike | None = None,
     ) -> Plan:
         """Return the plan for this control step; apply `plan.u0`.
 
         Args:
             x0: (nx,) state now.
             x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
-            obstacles: At most `max_obstacles` predictions over the same horizon.
+            obstacles: At most `max_obstacles` predictions over the same horizon. What happens to
+                late ones, and to named ones that are no longer given, is said by
+                `settings.freshness`.
+            time: Now [s], on the clock of the predictions' stamps; None for one interval after the
+                last step that returned a plan, or 0 at the first.
+            robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2].
 
         Raises:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
+            ConcurrentUseError: Another thread is using this controller.
         """
-        challenge = self._steps_touching % self.settings.sides_interval == 0
-        shifted = None if self._last is None else self._shifted
-        plan = self._solver.solve_from(x0, x_ref, obstacles, shifted, challenge)
-        self._last = plan.iterate
+        self._enter()
+        try:
+            recall = self._memory.recall(time, obstacles)
+            own = {} if robot_covariance is None else {"robot_covariance": robot_covariance}
+            plan = self._plan(x0, x_ref, recall, own)
+            sound = self._within(plan)
+            if not sound:
+                plan = self._bounded(plan, x0, x_ref)
+            self._memory.commit(recall)
+            self._keep(plan, recall, plan.iterate if sound else None)
+            return plan
+        finally:
+            self._busy.release()
+
+    def reset(self) -> None:
+        """Forget all steps: the next one is bit for bit that of a new controller.
+
+        Raises:
+            ConcurrentUseError: Another thread is using this controller.
+        """
+        self._enter()
+        try:
+            self._forget()
+        finally:
+            self._busy.release()
+
+    def _enter(self) -> None:
+        if not self._busy.acquire(blocking=False):
+            raise ConcurrentUseError(
+                "this controller is at work in another thread; give each its own"
+            )
+
+    def _plan(self, x0: ArrayLike, x_ref: ArrayLike, recall: Recall, own: dict[str, Any]) -> Plan:
+        if recall.stale is None:
+            challenge = self._steps_touching % self.settings.sides_interval == 0
+            shifted = None if self._last is None else self._shifted
+            return self._solver.solve_from(x0, x_ref, recall.obstacles, shifted, challenge, **own)
+        if self.settings.freshness.beyond == "refuse":
+            raise recall.stale
+        StepData.read(self.problem, x0, x_ref, recall.obstacles)  # bad arguments are refused first
+        _log.warning("%s: braking", recall.stale)
+        return self._solver.brake(x0, x_ref, Status.STALE)  # type: ignore[attr-defined]
+
+    def _within(self, plan: Plan) -> bool:
+        lower, upper = self.problem.u_min, self.problem.u_max
+        return bool(((lower <= plan.u0) & (plan.u0 <= upper)).all())  # False for NaN
+
+    def _bounded(self, plan: Plan, x0: ArrayLike, x_ref: ArrayLike) -> Plan:
+        """The last guard: brake instead of an input that must not be applied."""
+        lower, upper = self.problem.u_min, self.problem.u_max
+        _log.error("input %s is outside [%s, %s]: braking", plan.u0, lower, upper)
+        plan = self._solver.brake(x0, x_ref, Status.FALLBACK)  # type: ignore[attr-defined]
+        return replace(plan, U=frozen(np.clip(np.nan_to_num(plan.U), lower, upper)))
+
+    def _keep(self, plan: Plan, recall: Recall, start: Iterate | None) -> None:
+        self._last = start
+        self._obstacles = recall.obstacles
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
-        return plan
+        self._counts[plan.status] += 1
+        deadline = self.settings.deadline
+        if deadline is not None and plan.timing.total > deadline:
+            self.overruns += 1
 
     def _shifted(self) -> Iterate:
         assert self._last is not None
         return self._last.shifted(self.problem.model)
-
-    def reset(self) -> None:
-        """Forget the last plan: the next step is bit for bit that of a new controller."""
-        self._last = None
-        self._steps_touching = 0
