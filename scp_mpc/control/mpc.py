@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +25,7 @@ from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Plan, Status
 from scp_mpc.solver.scp import SCP
 from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
 
 _log = logging.getLogger(__name__)
 
@@ -111,11 +111,11 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
+        watch = self._solver.stopwatch()
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)
-            own = {} if robot_covariance is None else {"robot_covariance": robot_covariance}
-            plan = self._plan(x0, x_ref, recall, own)
+            plan = self._plan(x0, x_ref, recall, robot_covariance, watch)
             sound = self._within(plan)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref)
@@ -143,16 +143,27 @@ class MPC:
                 "this controller is at work in another thread; give each its own"
             )
 
-    def _plan(self, x0: ArrayLike, x_ref: ArrayLike, recall: Recall, own: dict[str, Any]) -> Plan:
+    def _plan(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        recall: Recall,
+        robot_covariance: ArrayLike | None,
+        watch: Stopwatch,
+    ) -> Plan:
         if recall.stale is None:
             challenge = self._steps_touching % self.settings.sides_interval == 0
             shifted = None if self._last is None else self._shifted
-            return self._solver.solve_from(x0, x_ref, recall.obstacles, shifted, challenge, **own)
+            return self._solver.solve_from(
+                x0, x_ref, recall.obstacles, shifted, challenge, robot_covariance, watch
+            )
         if self.settings.freshness.beyond == "refuse":
             raise recall.stale
-        StepData.read(self.problem, x0, x_ref, recall.obstacles)  # bad arguments are refused first
+        StepData.read(
+            self.problem, x0, x_ref, recall.obstacles, robot_covariance
+        )  # bad arguments are refused first
         _log.warning("%s: braking", recall.stale)
-        return self._solver.brake(x0, x_ref, Status.STALE)  # type: ignore[attr-defined]
+        return self._solver.brake(x0, x_ref, Status.STALE)
 
     def _within(self, plan: Plan) -> bool:
         lower, upper = self.problem.u_min, self.problem.u_max
@@ -162,7 +173,7 @@ class MPC:
         """The last guard: brake instead of an input that must not be applied."""
         lower, upper = self.problem.u_min, self.problem.u_max
         _log.error("input %s is outside [%s, %s]: braking", plan.u0, lower, upper)
-        plan = self._solver.brake(x0, x_ref, Status.FALLBACK)  # type: ignore[attr-defined]
+        plan = self._solver.brake(x0, x_ref, Status.FALLBACK)
         return replace(plan, U=frozen(np.clip(np.nan_to_num(plan.U), lower, upper)))
 
     def _keep(self, plan: Plan, recall: Recall, start: Iterate | None) -> None:

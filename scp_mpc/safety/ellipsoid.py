@@ -46,7 +46,8 @@ def signed_distance(
         The signed distances and the normals. n'y - |diag(e) n| underestimates the signed distance
         for any unit n, so that whatever rounding does to n errs on the safe side.
     """
-    tiny = max(_TINY * float(np.abs(y).max(initial=0.0) + semi_axes.max(initial=0.0)), _LEAST)
+    size = np.abs(y).max(axis=-1, keepdims=True) + semi_axes.max(axis=-1, keepdims=True)
+    tiny = np.maximum(_TINY * size, _LEAST)
     e = np.maximum(semi_axes, tiny)
     z = _off_the_medial_axis(y, tiny, side)
     e2 = e * e
@@ -69,7 +70,7 @@ def signed_distance(
     return np.add.reduce(n * y, axis=-1) - np.sqrt(np.add.reduce(en * en, axis=-1)), n
 
 
-def _off_the_medial_axis(y: FloatArray, tiny: float, side: Side | None) -> FloatArray:
+def _off_the_medial_axis(y: FloatArray, tiny: FloatArray, side: Side | None) -> FloatArray:
     """Replace vanishing coordinates by tiny ones with the sign of `side`."""
     vanishing = np.abs(y) < tiny
     if not vanishing.any():

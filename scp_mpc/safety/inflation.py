@@ -104,7 +104,7 @@ class ExactInflation(Inflation):
         stiffness = np.swapaxes(wide, -2, -1) @ wide - pulled[..., :, None] * pulled[..., None, :]
         stiffness *= (s[:, None, None] / half_width)[..., None]
         stiffness += np.maximum(sd, _POINT)[..., None, None] * np.eye(T.shape[-1])
-        L = T @ inverse_root(stiffness)
+        L = T @ inverse_root(stiffness, _POINT)
         return np.concatenate([sets.rotations @ L, -pull[..., None, :] @ L], axis=-2)
 
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:

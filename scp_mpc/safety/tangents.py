@@ -3,7 +3,7 @@
 Notation:
     n   (..., d)        unit vector
     T   (..., d, d-1)   orthonormal columns square to n
-    M   (..., k, k)     symmetric positive definite, k = d - 1 = 1 or 2
+    M   (..., k, k)     symmetric positive semi-definite, k = d - 1 = 1 or 2
 """
 
 import numpy as np
@@ -25,9 +25,10 @@ def tangents(n: FloatArray) -> FloatArray:
     return np.eye(n.shape[-1])[:, :-1] - share[..., None, None] * outer
 
 
-def inverse_root(M: FloatArray) -> FloatArray:
-    """Return C (..., k, k) with C C' = M^-1."""
+def inverse_root(M: FloatArray, least: float) -> FloatArray:
+    """Return C (..., k, k) with C C' = M^-1, whose eigenvalues count as no less than `least`."""
     if M.shape[-1] == 1:
-        return 1.0 / np.sqrt(M)
-    root: FloatArray = np.swapaxes(np.linalg.inv(np.linalg.cholesky(M)), -2, -1)
+        return 1.0 / np.sqrt(np.maximum(M, least))
+    eigenvalues, vectors = np.linalg.eigh(M)
+    root: FloatArray = vectors / np.sqrt(np.maximum(eigenvalues, least))[..., None, :]
     return root

@@ -98,20 +98,24 @@ class CondensedSCP:
         y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
         near = touched = nominal.touched[: data.count]
         bounds, iterations = self._active_bounds(nominal), 0
+        last: Descent | None = None
         while True:
             near = self._near(at.path(y)[None], y[c.s], near)
             if np.count_nonzero(near) > _MANY * c.sampling.count:
-                return None
+                return last
             conflicts = Conflicts(data, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
             newton = Newton(at, conflicts, self._settings, goal)
             end = newton.descend(y, active, limit - iterations)
             if end is None:
-                return None
+                return last
             iterations, y = iterations + end.iterations, end.point.y
             missed = data.within(at.path(y), y[c.s], 0.0, known=near)
-            if missed is None or iterations >= limit:
+            if missed is None:
                 return self._ended(end.point, end.cap, iterations)
+            last = self._ended(end.point, end.cap, iterations, data.depths(at.path(y)[1:], y[c.s]))
+            if iterations >= limit:
+                return last
             bounds = end.active[: len(bounds)]
             touched = conflicts.table(end.active[len(bounds) :] != 0, *near.shape)
 
@@ -196,18 +200,27 @@ class CondensedSCP:
             active[forces < -NEGLIGIBLE], active[forces > NEGLIGIBLE] = -1, 1
         return active
 
-    def _ended(self, point: Point, cap: float, iterations: int) -> Descent:
+    def _ended(
+        self, point: Point, cap: float, iterations: int, depths: FloatArray | None = None
+    ) -> Descent:
+        """Judge a point; `depths` (J, C) are its violations where pairs were left out."""
+        residuals, slack = point.residuals, point.slack
+        if depths is None and residuals.feasibility > self._settings.tolerance:
+            depths = self._at.data.depths(self._at.path(point.y)[1:], point.y[self._condensed.s])
         most = 0.0 if point.pushed is None else float(point.pushed.slack.max())
+        if depths is not None:
+            most, slack = float(depths.max(initial=0.0)), float(depths.sum())
+            residuals = replace(residuals, feasibility=max(residuals.feasibility, most))
         return Descent(
-            partial(self._iterate, point, cap),
+            partial(self._iterate, point, cap, depths),
             point.cost,
-            point.cost + self._problem.slack_weight * point.slack,
-            point.residuals,
-            judge(point.residuals, most, self._settings.tolerance),
+            point.cost + self._problem.slack_weight * slack,
+            residuals,
+            judge(residuals, most, self._settings.tolerance),
             iterations,
         )
 
-    def _iterate(self, point: Point, cap: float) -> Iterate:
+    def _iterate(self, point: Point, cap: float, depths: FloatArray | None = None) -> Iterate:
         """Name the parts of a point in the words of the problem."""
         problem, c, data = self._problem, self._condensed, self._at.data
         N, M, nu = problem.horizon, problem.max_obstacles, problem.model.nu
@@ -223,6 +236,8 @@ class CondensedSCP:
             if not c.moving_sizes:  # the bound takes whatever pushes a size that cannot move
                 pull = force * point.pushed.tangent.a[:, -1]
                 margin = np.bincount(pairs.obstacle, weights=pull, minlength=M).astype(np.float64)
+        if depths is not None:
+            slack[: data.count] = depths
         inputs, pins = point.reaction[: N * nu].reshape(N, nu), forces
         if np.isfinite(cap):
             pins = forces - cap

@@ -88,6 +88,8 @@ class Newton:
             ahead = self._ahead(tangent, program, held, leaps) if bold else None
             point = self._step.point(self._conflicts, ahead if isinstance(ahead, Held) else held)
             watch.learn("program", began)
+            if not np.isfinite(point.cost):
+                return end
             if leaps and end is not None and self._merit(point) > self._merit(end.point):
                 tangent, leaps, bold = end.point.tangent, 0, False  # take the leap back
                 continue

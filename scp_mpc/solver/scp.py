@@ -12,6 +12,7 @@
 Where the robot is fast, constraints hold at points between the samples, too (`resolution.py`).
 """
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,9 +42,12 @@ from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Pace, Stopwatch
 from scp_mpc.trajectory import Trajectory
 
+_log = logging.getLogger(__name__)
+
 # A rival must be better by this share, or the plan flickers between sides of equal cost.
 _HYSTERESIS = 0.001
 _CORRECTIONS = 3  # of what was assumed about the motion between points
+_WARM_UP = 3  # steps
 _ROUNDS = 6  # of risk allocation at most
 _GAIN = 0.001  # share of the cost that makes another round worth while
 
@@ -65,6 +69,8 @@ class SCP:
         self._busy, self._pace = Lock(), Pace()
         self._resolution = Resolution(problem, self.settings)
         self._ladder = Ladder(problem, self.settings.tolerance)
+        if self.settings.deadline is not None:
+            self._warm_up()
 
     def solve(
         self,
@@ -102,15 +108,21 @@ class SCP:
         nominal: Callable[[], Iterate] | None,
         challenge: bool,
         robot_covariance: ArrayLike | None = None,
+        watch: Stopwatch | None = None,
     ) -> Plan:
-        """`solve`, with a nominal plan that is made only where it is needed."""
+        """`solve`, with a nominal plan made only where it is needed, and a clock that may run."""
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
-            watch = Stopwatch(self.settings.deadline, self._pace)
+            watch = self.stopwatch() if watch is None else watch
             sampling = self._resolution.coarse.sampling
             step = StepData.read(self.problem, x0, x_ref, obstacles, robot_covariance, sampling)
-            return self._solve(step, watch, nominal, challenge)
+            try:
+                return self._solve(step, watch, nominal, challenge)
+            except (ArithmeticError, np.linalg.LinAlgError):
+                _log.exception("a computation broke down: the last plan, or braking")
+                found = _Found(self._ladder.resort(step, nominal() if nominal else None))
+                return self._plan(step, found, watch, {})
         finally:
             self._busy.release()
 
@@ -121,9 +133,24 @@ class SCP:
         found = _Found(self._ladder.brake(step, status))
         return self._plan(step, found, watch, {})
 
+    def stopwatch(self) -> Stopwatch:
+        """The clock of a step that begins now."""
+        return Stopwatch(self.settings.deadline, self._pace)
+
     def forget(self) -> None:
         """Forget what earlier programs left behind: the next step is that of a new solver."""
         self._resolution.forget()
+
+    def _warm_up(self) -> None:
+        """Solve a step with an obstacle in the way: first calls are slow, and paces unknown."""
+        problem, model = self.problem, self.problem.model
+        way = np.zeros((problem.horizon + 1, model.nx))
+        way[:, model.position[0]] = np.linspace(0.0, 4.0, len(way))
+        means = np.full((len(way), model.dim), 0.1)
+        means[:, 0] += 2.0
+        block = ObstaclePrediction(means, 0.01 * np.eye(model.dim), 0.1)
+        for _ in range(_WARM_UP):
+            self.solve(way[0], way, [block] * min(problem.max_obstacles, 1))
 
     def _solve(
         self,

@@ -12,6 +12,7 @@ residual, and a step without an active obstacle takes one QP.
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -172,6 +173,7 @@ class SparseSCP:
         with self.watch.linearising:
             spaces = self.step.half_spaces(iterate.states, iterate.s, iterate.inputs)
             self._subproblem.write_half_spaces(spaces)
+            self._depths = np.maximum(0.0, -spaces.value)
 
     def _ended(
         self,
@@ -179,6 +181,9 @@ class SparseSCP:
         residuals: KKTResiduals,
         iterations: int,
     ) -> Descent:
+        if residuals.worst > self._settings.tolerance:  # the slack is about the last nominal
+            iterate = replace(iterate, slack=self._depths)
+            residuals = self._subproblem.residuals(iterate)
         status = judge(residuals, iterate.slack.max(initial=0.0), self._settings.tolerance)
         cost = self._cost(iterate)
         merit = cost + self._penalty(iterate)
