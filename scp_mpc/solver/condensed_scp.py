@@ -94,6 +94,9 @@ class CondensedSCP:
         at, c, data = self._at, self._condensed, self._at.data
         if not data.count:  # the free plan was the only one, and it did not hold up
             return None
+        if not at.watch.affords("first program"):
+            return None
+        began = at.watch.elapsed
         p = c.sampling.positions(nominal.states, nominal.inputs) - data.track[1:]
         y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
         near = touched = nominal.touched[: data.count]
@@ -101,12 +104,12 @@ class CondensedSCP:
         last: Descent | None = None
         while True:
             near = self._near(at.path(y)[None], y[c.s], near)
-            if np.count_nonzero(near) > _MANY * c.sampling.count:
+            if self._too_many(near):
                 return last
             conflicts = Conflicts(data, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
             newton = Newton(at, conflicts, self._settings, goal)
-            end = newton.descend(y, active, limit - iterations)
+            end = newton.descend(y, active, limit - iterations, began)
             if end is None:
                 return last
             iterations, y = iterations + end.iterations, end.point.y
@@ -114,8 +117,9 @@ class CondensedSCP:
             if missed is None:
                 return self._ended(end.point, end.cap, iterations)
             last = self._ended(end.point, end.cap, iterations, data.depths(at.path(y)[1:], y[c.s]))
-            if iterations >= limit:
+            if iterations >= limit or not at.watch.affords("first program"):
                 return last
+            began = at.watch.elapsed
             bounds = end.active[: len(bounds)]
             touched = conflicts.table(end.active[len(bounds) :] != 0, *near.shape)
 
@@ -138,7 +142,7 @@ class CondensedSCP:
         here[1:] = c.sampling.positions(best.states, best.inputs)
         known = np.stack([at.path(at.within_bounds[0]), here])
         near = self._near(known, best.s, np.zeros((data.count, len(paths[0])), dtype=np.bool_))
-        if np.count_nonzero(near) > _MANY * c.sampling.count:
+        if self._too_many(near):
             return []
         conflicts = Conflicts(data, c, near)
         with at.watch.linearising:
@@ -184,12 +188,24 @@ class CondensedSCP:
         states[1:] += self._condensed.deviations(inputs)
         return replace(best, states=states, inputs=inputs)
 
+    def _too_many(self, near: BoolArray) -> bool:
+        """Whether a sparse program is quicker; with a deadline it is never asked."""
+        if self._at.watch.deadline < np.inf:
+            return False
+        return int(np.count_nonzero(near)) > _MANY * self._condensed.sampling.count
+
     def _near(self, paths: FloatArray, s: FloatArray, near: BoolArray) -> BoolArray:
-        """Pairs in `near` (J, C), or near to one of the paths (c, C+1, d); all if there is none."""
+        """Pairs in `near` (J, C), or near to one of the paths (c, C+1, d).
+
+        If there is none, those near to the plan that ignores the obstacles; or else all.
+        """
         for path in paths:
             more = self._at.data.within(path, s, _NEAR, known=near)
             near = near if more is None else near | more
-        return near if near.any() else ~near
+        if near.any():
+            return near
+        more = self._at.data.within(self._at.path(self._at.within_bounds[0]), s, _NEAR)
+        return ~near if more is None else more
 
     def _active_bounds(self, nominal: Iterate) -> IntArray:
         """Which bounded entries a nominal plan holds: -1 at lower, 1 at upper bounds."""

@@ -16,7 +16,8 @@ from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
 from scp_mpc.solver.step_data import StepData
-from scp_mpc.trajectory import rollout
+
+_AT_REST = 1e-9  # of an input, in its own unit, that is none
 
 
 class Ladder:
@@ -45,36 +46,46 @@ class Ladder:
 
     def keep(self, step: StepData, inputs: FloatArray) -> Descent:
         """Roll the last plan's inputs (N, nu) out from the state now."""
-        problem = self._problem
-        return self._judged(step, np.clip(inputs, problem.u_min, problem.u_max), Status.PREVIOUS)
+        problem, model = self._problem, self._problem.model
+        U = np.clip(inputs, problem.u_min, problem.u_max)
+        states = np.empty((problem.horizon + 1, model.nx))
+        states[0] = step.x0
+        for i, u in enumerate(U):
+            states[i + 1] = model.step(states[i], u)
+        return self._judged(step, states, U, Status.PREVIOUS)
 
     def brake(self, step: StepData, status: Status = Status.BRAKING) -> Descent:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
-        problem, x = self._problem, step.x0
-        rest = np.clip(np.zeros(problem.model.nu), problem.u_min, problem.u_max)
-        inputs = np.tile(rest, (problem.horizon, 1))
-        for u in inputs:
-            wanted = problem.model.brake(x) - rest
-            if not wanted.any():
-                break
-            room = np.where(wanted > 0, problem.u_max - rest, problem.u_min - rest)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.where(wanted == 0, 1.0, room / wanted).min()
-            u += min(1.0, share) * wanted
-            x = problem.model.step(x, u)
-        return self._judged(step, np.clip(inputs, problem.u_min, problem.u_max), status)
+        problem, model = self._problem, self._problem.model
+        rest = np.clip(np.zeros(model.nu), problem.u_min, problem.u_max)
+        most, least = problem.u_max - rest, problem.u_min - rest
+        U = np.tile(rest, (problem.horizon, 1))
+        states = np.empty((problem.horizon + 1, model.nx))
+        states[0] = step.x0
+        moving = True
+        for i, u in enumerate(U):
+            wanted = model.brake(states[i]) - rest if moving else rest
+            moving = moving and float(np.abs(wanted).max()) > _AT_REST
+            if moving:
+                # The largest share of the way to the wanted input that the bounds allow.
+                over = np.maximum(wanted / np.maximum(most, _AT_REST), 1.0)
+                under = np.maximum(wanted / np.minimum(least, -_AT_REST), 1.0)
+                u += wanted / max(over.max(), under.max())
+            states[i + 1] = model.step(states[i], u)
+        return self._judged(step, states, np.clip(U, problem.u_min, problem.u_max), status)
 
-    def _judged(self, step: StepData, inputs: FloatArray, status: Status) -> Descent:
-        """The trajectory of some inputs, with its true violation; FALLBACK where there is any."""
+    def _judged(
+        self, step: StepData, states: FloatArray, inputs: FloatArray, status: Status
+    ) -> Descent:
+        """A trajectory with its true violation; FALLBACK where there is any."""
         problem = self._problem
-        states = rollout(problem.model.step, step.x0, inputs).states
         s = np.full(problem.max_obstacles, problem.size.lower)
         slack = np.zeros((problem.max_obstacles, step.sampling.points))
         slack[: step.count] = step.depths(step.sampling.positions(states, inputs), s)
-        if status.ok and slack.max(initial=0.0) > self._tolerance:
+        most = float(slack.max(initial=0.0))
+        if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
-        residuals = KKTResiduals(np.inf, float(slack.max(initial=0.0)), np.inf)
         cost = problem.cost(states, inputs, s, step.x_ref)
         merit = cost + problem.slack_weight * float(slack.sum())
-        iterate = Iterate(states, inputs, s, slack)
-        return Descent(iterate.frozen, cost, merit, residuals, status, 0)
+        residuals = KKTResiduals(np.inf, most, np.inf)
+        return Descent(Iterate(states, inputs, s, slack).frozen, cost, merit, residuals, status, 0)

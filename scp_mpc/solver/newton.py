@@ -71,14 +71,21 @@ class Newton:
         self._tolerance = settings.tolerance
         self._cap = np.inf
 
-    def descend(self, y: FloatArray, active: IntArray, limit: int) -> End | None:
-        """Descend from y (ny,), for at most `limit` programs; None if given up or unsolved."""
+    def descend(
+        self, y: FloatArray, active: IntArray, limit: int, began: float = 0.0
+    ) -> End | None:
+        """Descend from y (ny,), for at most `limit` programs; None if given up or unsolved.
+
+        `began` is when the step's clock showed the work for the first one to begin.
+        """
         tangent, end, leaps, bold = self._conflicts.tangent(y), None, 0, True
         watch = self._step.watch
         for iteration in range(1, limit + 1):
-            if not watch.affords("program"):
-                break
-            began = watch.elapsed
+            task = "first program" if iteration == 1 else "program"
+            if iteration > 1:
+                if not watch.affords(task):
+                    break
+                began = watch.elapsed
             solved = self._solve(tangent, active)
             if solved is None:
                 if watch.remaining < 0:
@@ -87,7 +94,7 @@ class Newton:
             program, held = solved
             ahead = self._ahead(tangent, program, held, leaps) if bold else None
             point = self._step.point(self._conflicts, ahead if isinstance(ahead, Held) else held)
-            watch.learn("program", began)
+            watch.learn(task, began)
             if not np.isfinite(point.cost):
                 return end
             if leaps and end is not None and self._merit(point) > self._merit(end.point):
@@ -113,6 +120,7 @@ class Newton:
             program = self._step.convex(self._conflicts, tangent)
             held = self._step.solve(program, active, self._cap)
             firm = self._goal is not None and self._goal.status.ok  # slack would not beat it
+            firm = firm or self._step.watch.remaining < 0  # it was the time that ran out
             if held is None and not firm and np.isinf(self._cap):
                 self._cap = self._step.problem.slack_weight
                 held = self._step.solve(program, active, self._cap)

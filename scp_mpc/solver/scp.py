@@ -37,7 +37,7 @@ from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.ladder import Ladder
 from scp_mpc.solver.plan import Candidate, Plan, Status, Timing
 from scp_mpc.solver.resolution import Resolution, exposed
-from scp_mpc.solver.sides import Passing, candidates, same_way
+from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Pace, Stopwatch
 from scp_mpc.trajectory import Trajectory
@@ -170,9 +170,10 @@ class SCP:
         for _ in range(_CORRECTIONS):
             wide = self._resolution.widened(engine, step, sweep)
             found = _Found(engine.descend(start) or self._ladder.resort(wide, last))
-            if self._contested(found.best, challenge) and watch.affords("ways"):
+            if self._contested(found.best, challenge):
                 found = self._challenge(engine, wide, watch, found.best)
             found = self._allocate(engine, wide, watch, found)
+            ending = watch.elapsed
             found = self._rescue(engine, wide, last, found)
             if self._resolution.kept(engine, step, sweep, found.best):
                 break
@@ -180,7 +181,9 @@ class SCP:
             sweep = self._resolution.corrected(engine, sweep, found.best)
         else:
             found = replace(found, best=exposed(found.best))
-        return self._plan(wide, found, watch, self._resolution.finished(engine))
+        plan = self._plan(wide, found, watch, self._resolution.finished(engine))
+        watch.learn("ending", ending)
+        return plan
 
     def _contested(self, best: Descent, challenge: bool) -> bool:
         """Whether other ways past the obstacles are worth a look."""
@@ -191,14 +194,17 @@ class SCP:
         self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent
     ) -> "_Found":
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
+        most = watch.room("way", MAX_CANDIDATES, then="first program")
+        if not most:
+            return _Found(best)
         began = watch.elapsed
         full = np.full(self.problem.max_obstacles, self.problem.size.reference)
         here = Passing(engine.path(best.iterate), best.iterate.touched[: step.count])
-        sides = candidates(step, engine.free_path(), here.path, full)
+        sides = candidates(step, engine.free_path(), here.path, full, most)
         present = replace(best.iterate, s=full)
         safe = best.status.ok
         starts = engine.glimpses(present, [side.path for side in sides], firm=safe)
-        watch.learn("ways", began)
+        watch.learn("way", began, len(sides))
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=False)  # none if they are too many
@@ -207,7 +213,7 @@ class SCP:
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
         # A plan with slack is followed by any without: then all ways are worth their time.
         for start in ranked[: self.settings.rivals] if safe else ranked:
-            if (not safe and goal.status.ok) or not watch.affords("program"):
+            if (not safe and goal.status.ok) or not watch.affords("first program"):
                 break
             if safe and same_way(step, Passing(start.path, start.touched), here):
                 continue  # this way leads to where we are
@@ -225,7 +231,7 @@ class SCP:
             return found
         allocated = np.full(step.radii.shape, margin.delta / step.radii.size)
         for _ in range(_ROUNDS):
-            if not (best.status.ok and best.iterate.touches and watch.affords("program")):
+            if not (best.status.ok and best.iterate.touches and watch.affords("first program")):
                 break
             wanted = reallocated(allocated, point_risks(step, engine.path(best.iterate)))
             engine.widen(step.scaled(size_at_risk(wanted)))
@@ -242,7 +248,7 @@ class SCP:
         self, engine: Engine, step: StepData, last: Iterate | None, found: "_Found"
     ) -> "_Found":
         """Without a plan that meets every constraint: descend from one that does, if known."""
-        if found.best.status.ok:
+        if found.best.status.ok or found.best.status is Status.FALLBACK:
             return found
         known = self._ladder.resort(step, last)
         if not known.status.ok:
@@ -253,11 +259,11 @@ class SCP:
     def _plan(
         self, step: StepData, found: "_Found", watch: Stopwatch, qps: Mapping[str, int]
     ) -> Plan:
-        ending, best = watch.elapsed, found.best
-        iterate, inside = best.iterate, watch.inside.seconds
+        best, inside = found.best, watch.inside.seconds
+        iterate = best.iterate
         path = step.sampling.positions(iterate.states, iterate.inputs)
         slack = step.sampling.stages(iterate.slack[: step.count]).max(axis=2, initial=0.0)
-        plan = Plan(
+        return Plan(
             X=iterate.states,
             U=iterate.inputs,
             s=iterate.s[: step.count],
@@ -278,8 +284,6 @@ class SCP:
             iterate=iterate,
             commitment=partial(plan_risk, step, path),
         )
-        watch.learn("ending", ending)
-        return plan
 
 
 @dataclass(frozen=True, eq=False)

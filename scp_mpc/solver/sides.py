@@ -62,7 +62,13 @@ class Passing:
     touched: BoolArray
 
 
-def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatArray) -> list[Side]:
+def candidates(
+    step: StepData,
+    free: FloatArray,
+    present: FloatArray,
+    s: FloatArray,
+    most: int = MAX_CANDIDATES,
+) -> list[Side]:
     """Return the ways past the obstacles in conflict, the first conflict first; none without any.
 
     Args:
@@ -70,6 +76,7 @@ def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatAr
         free: (C, d) positions of the plan that ignores the obstacles.
         present: (C, d) positions of the best plan so far.
         s: (M,) sizes of the ellipsoids.
+        most: How many ways to return at most.
     """
     conflict = step.conflicts(free, s)
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
@@ -82,7 +89,7 @@ def candidates(step: StepData, free: FloatArray, present: FloatArray, s: FloatAr
             step, free, _elsewhere(step, free, present, conflict, j), float(s[j]), j, conflict[j]
         )
     )
-    return list(islice(ways, MAX_CANDIDATES))
+    return list(islice(ways, most))
 
 
 def _elsewhere(

@@ -6,6 +6,7 @@ Notation:
 """
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -175,6 +176,13 @@ class StepData:
         size = self.problem.size_for(self.count, self.sampling.count)
         scale = size / self.problem.size.reference
         return replace(self, scale=None if scale == 1 else np.full(self.radii.shape, scale))
+
+    def widened(self, radii: FloatArray) -> "StepData":
+        """The same with other radii (J, C); what does not depend on them is not computed again."""
+        wide = copy(self)
+        vars(wide)["radii"] = radii
+        vars(wide).pop("sets", None)
+        return wide
 
     def scaled(self, sizes: FloatArray) -> "StepData":
         """The same with sizes (J, C) of their own at all points."""

@@ -5,6 +5,7 @@ from time import perf_counter
 from types import TracebackType
 
 _FORGET = 0.02  # of the difference to a shorter time, each time it is measured
+_LEAST = 1e-6  # [s] of any task
 _EASE = 0.9  # of a time, each time that it stood in the way: or one hiccup would do so for ever
 
 
@@ -100,7 +101,17 @@ class Stopwatch:
         self._pace.ease(task)
         return False
 
-    def learn(self, task: str, since: float) -> None:
-        """Note that a task took from `since`, in seconds `elapsed`, until now."""
-        if self._deadline < inf:
-            self._pace.learn(task, self.elapsed - since)
+    def room(self, task: str, most: int, then: str) -> int:
+        """How often, up to `most` times, a task fits in before another one, as predicted."""
+        if self._deadline == inf:
+            return most
+        spare = self.remaining - self._pace.expected(then) - self._pace.expected("ending")
+        times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
+        if times < most:
+            self._pace.ease(task)
+        return times
+
+    def learn(self, task: str, since: float, times: int = 1) -> None:
+        """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""
+        if self._deadline < inf and times:
+            self._pace.learn(task, (self.elapsed - since) / times)

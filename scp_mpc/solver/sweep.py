@@ -13,7 +13,7 @@ Notation:
             with three standard deviations of what its covariance grows by
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def too_fast(step: StepData, sweep: Sweep) -> bool:
 def swept(step: StepData, sweep: Sweep) -> StepData:
     """The step with radii that leave room for what happens between its points."""
     way = (sweep.chord + _drift(step)) / 2
-    return replace(step, radii=np.hypot(step.radii + sweep.sag, way))
+    return step.widened(np.hypot(step.radii + sweep.sag, way))
 
 
 def _drift(step: StepData) -> FloatArray:
