@@ -5,26 +5,23 @@ Notation:
     used    (J, C)  risk bound of the plan that was found with it
 """
 
-import numpy as np
-
 from scp_mpc.arrays import FloatArray
-from scp_mpc.safety.risk import LEAST_RISK
 
-_KEPT = 0.1  # of the unused risk that stays where it is
-_ACTIVE = 0.99  # share of the allocated risk from which it counts as used up
+_EVEN = 0.1  # of the joint risk that is spread evenly, so that nobody is left with nothing
 
 
 def reallocated(allocated: FloatArray, used: FloatArray) -> FloatArray:
     """Return an allocation (J, C) with the same sum, under which the plan remains feasible.
 
-    An inactive constraint keeps what it used and a share of the rest; the active ones divide what
-    is left over. Nobody is given less than it used, so that the cost cannot rise.
+        delta_new = (1 - k) sum(delta) used / sum(used) + k mean(delta)
+
+    Nobody is given less than it used, so that the cost cannot rise. Ono and Williams divide what
+    is left over among the active constraints alone; in proportion to the use it reaches their
+    neighbours in time, too, who would hold the plan up next.
     """
-    active = used >= _ACTIVE * allocated
-    if not active.any():
+    total, spent = allocated.sum(), used.sum()
+    if not 0 < spent < total:
         return allocated
-    lower = np.maximum(used + _KEPT * (allocated - used), LEAST_RISK)
-    left = np.minimum(lower, allocated)
-    new = np.where(active, allocated, left)
-    new[active] += (allocated.sum() - new.sum()) / np.count_nonzero(active)
-    return new
+    even = min(_EVEN, (1 - spent / total) / 2)
+    new: FloatArray = (1 - even) * total / spent * used + even * total / used.size
+    return new * (total / new.sum())

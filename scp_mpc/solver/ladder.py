@@ -67,10 +67,12 @@ class Ladder:
             wanted = model.brake(states[i]) - rest if moving else rest
             moving = moving and float(np.abs(wanted).max()) > _AT_REST
             if moving:
-                # The largest share of the way to the wanted input that the bounds allow.
-                over = np.maximum(wanted / np.maximum(most, _AT_REST), 1.0)
-                under = np.maximum(wanted / np.minimum(least, -_AT_REST), 1.0)
-                u += wanted / max(over.max(), under.max())
+                # As far as the bounds allow in the direction of what is wanted; inputs without
+                # any room stay where they are.
+                room = np.where(wanted > 0, most, least)
+                wanted = np.where(room == 0, 0.0, wanted)
+                room = np.where(room == 0, 1.0, room)
+                u += wanted / np.maximum(wanted / room, 1.0).max()
             states[i + 1] = model.step(states[i], u)
         return self._judged(step, states, np.clip(U, problem.u_min, problem.u_max), status)
 

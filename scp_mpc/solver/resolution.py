@@ -48,20 +48,31 @@ class Resolution:
         self.fine.forget()
 
     def begin(self, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData, Descent | None]:
-        """Choose the engine and begin the step; the third is the free plan, if that is clear."""
-        engine = self.coarse
+        """Begin a step at the samples; the third is the free plan, if that is clear."""
+        engine, wide = self.coarse, step
         engine.begin(step, watch)
-        if not self._covers_gaps or not step.count:
-            return engine, step, engine.unhindered()
-        sweep = engine.free_sweep()
-        wide = self.widened(engine, step, sweep)
-        best = engine.unhindered()
-        if best is None and too_fast(step, sweep):
-            engine, step = self.fine, step.sampled(self.fine.sampling)
-            engine.begin(step, watch)
+        if self._covers_gaps and step.count:
             wide = self.widened(engine, step, engine.free_sweep())
-            best = engine.unhindered()
+        best = engine.unhindered()
         return engine, step if best is None else wide, best
+
+    def refined(
+        self, step: StepData, watch: Stopwatch, last: Iterate | None
+    ) -> tuple[Engine, StepData, Descent | None]:
+        """Go on between the samples, if the free plan or the last one is too fast for less."""
+        coarse, fine = self.coarse, self.fine
+        if not self._covers_gaps or not step.count:
+            return coarse, step, None
+        sweep = coarse.free_sweep()
+        if last is not None:
+            sweep = sweep.and_more(coarse.sweep(last))
+        if not too_fast(step, sweep):
+            return coarse, step, None
+        step = step.sampled(fine.sampling)
+        fine.begin(step, watch)
+        wide = self.widened(fine, step, fine.free_sweep())
+        best = fine.unhindered()
+        return fine, step if best is None else wide, best
 
     def finished(self, engine: Engine) -> Counter[str]:
         """Programs solved in this control step, which ended with this engine."""

@@ -161,11 +161,14 @@ class SCP:
     ) -> Plan:
         if nominal is None:
             self.forget()
+        last = None
         engine, step, free = self._resolution.begin(step, watch)
+        if free is None:
+            last = None if nominal is None else nominal()
+            engine, step, free = self._resolution.refined(step, watch, last)
         if free is not None:
             return self._plan(step, _Found(free), watch, self._resolution.finished(engine))
-        last = None if nominal is None else nominal().resampled(engine.sampling.count)
-        start = engine.free() if last is None else last
+        start = engine.free() if last is None else last.resampled(engine.sampling.count)
         sweep = self._resolution.assumed(engine, start)
         for _ in range(_CORRECTIONS):
             wide = self._resolution.widened(engine, step, sweep)

@@ -1,0 +1,246 @@
+"""The ladder: deadlines, the last plan, braking, and what is said about each."""
+
+import time
+
+import numpy as np
+import pytest
+from driving import N
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import DT, obstacle, problem, straight_reference
+
+from scp_mpc import (
+    MPC,
+    SCP,
+    DoubleIntegrator,
+    LinearModel,
+    ObstaclePrediction,
+    Settings,
+    Status,
+    Trajectory,
+)
+from scp_mpc.solver import active_set
+from scp_mpc.solver.stopwatch import Pace, Stopwatch
+
+
+def test_each_status_has_a_sentence_and_knows_whether_it_is_safe():
+    safe = {Status.CONVERGED, Status.FEASIBLE, Status.PREVIOUS, Status.BRAKING}
+    assert {status for status in Status if status.ok} == safe
+    assert all(status.value.endswith(".") and len(status.value) > 30 for status in Status)
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    x=st.tuples(*[st.floats(-5, 5)] * 4),
+    bounds=st.tuples(*[st.floats(0.5, 4)] * 4),
+)
+def test_braking_is_straight_within_bounds_and_comes_to_rest(x, bounds):
+    least, most = -np.array(bounds[:2]), np.array(bounds[2:])
+    case = problem(60, u_min=least, u_max=most)
+    plan = SCP(case).brake(np.array(x), np.zeros(4))
+    assert plan.status is Status.BRAKING
+    assert (least <= plan.U).all()
+    assert (most >= plan.U).all()
+    v = plan.X[:, [1, 3]]
+    speed = np.linalg.norm(v, axis=1)
+    assert (np.diff(speed) <= 1e-9).all()
+    assert speed[-1] < 1e-6
+    across = v[:, 0] * x[3] - v[:, 1] * x[1]
+    np.testing.assert_allclose(across, 0, atol=1e-6)
+    if speed[1] > 1e-6:  # the first input brakes as hard as its direction allows
+        assert np.isclose(plan.u0, least).any() or np.isclose(plan.u0, most).any()
+
+
+def test_braking_where_no_input_is_not_allowed():
+    """Bounds that exclude zero: as near to rest as they permit."""
+    case = problem(10, u_min=[0.5, -3.0], u_max=[3.0, 3.0])
+    plan = SCP(case).brake(np.array([0.0, 2.0, 0.0, 1.0]), np.zeros(4))
+    assert (plan.U[:, 0] == 0.5).all()
+    assert plan.X[-1, 3] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_robot_that_is_moved_by_velocities_brakes_by_standing_still():
+    walker = LinearModel(np.eye(2), DT * np.eye(2), DT, [0, 1])
+    case = problem(5, model=walker, Q=[1.0, 1.0], R=[0.1, 0.1])
+    plan = SCP(case).brake(np.array([1.0, 2.0]), np.zeros(2))
+    assert not plan.U.any()
+
+
+def closing(speed):
+    """A robot at some speed, and an obstacle that appears in its way."""
+    ref = straight_reference(N, speed)
+    return ref[0], ref, [obstacle(N, (2.6, 0.05), growth=0.0)]
+
+
+def test_out_of_time_the_last_plan_is_kept_if_it_is_still_clear():
+    mpc = MPC(problem(N))
+    x0, ref, ahead = closing(2.0)
+    first = mpc.step(x0, ref, ahead)
+    assert first.ok
+    # A second controller has no time at all; it takes over the first one's plan.
+    x1 = problem(N).model.step(x0, first.u0)
+    hurried = SCP(problem(N), Settings(deadline=1e-9))
+    kept = hurried.solve(x1, ref, shifted(ahead), guess=mpc.nominal())
+    assert kept.status is Status.PREVIOUS
+    assert kept.ok
+    np.testing.assert_allclose(kept.U[:-1], first.U[1:], atol=1e-12)
+    assert kept.slack.max() == 0
+    # The obstacle has turned out to be elsewhere: the last plan is not clear any more.
+    onto = [obstacle(N, (1.9, float(first.X[5, 2])), growth=0.0)]
+    braking = hurried.solve(x1, ref, onto, guess=mpc.nominal())
+    assert braking.status in (Status.BRAKING, Status.FALLBACK)
+    assert braking.ok == (braking.slack.max() <= 1e-6)
+    np.testing.assert_allclose(braking.u0, hurried.brake(x1, ref).u0)
+
+
+def shifted(obstacles):
+    return [
+        ObstaclePrediction(np.vstack([o.means[1:], o.means[-1:]]), o.covariances, o.radius)
+        for o in obstacles
+    ]
+
+
+def test_too_fast_to_brake_is_no_safe_plan():
+    x0, ref, ahead = closing(4.0)
+    plan = SCP(problem(N), Settings(deadline=1e-9)).solve(x0, ref, ahead)
+    assert plan.status is Status.FALLBACK
+    assert not plan.ok
+    assert plan.slack.max() > 0.1
+    np.testing.assert_allclose(plan.u0, [-3.0, 0.0])
+
+
+def test_a_safe_plan_that_is_known_beats_slack():
+    """If the search ends with slack though braking is clear, the search begins from braking."""
+    case = problem(20)
+    ref = straight_reference(20, 2.0)
+    wall = [obstacle(20, (4.0, 0.0), covariance=np.diag([0.01, 4.0]), growth=0.0)]
+    lazy = SCP(case, Settings(sides=False, max_iterations=1))
+    onto = Trajectory(ref, np.zeros((20, 2)))
+    plan = lazy.solve(ref[0], ref, wall, onto)
+    assert plan.ok, plan.status
+
+
+def test_predictions_of_time_are_long_times_slowly_forgotten():
+    pace = Pace()
+    assert pace.expected("program") == 0
+    pace.learn("program", 2.0)
+    pace.learn("program", 1.0)
+    assert 1.9 < pace.expected("program") < 2.0
+    watch = Stopwatch(1.0, pace)
+    assert not watch.affords("program")
+    tries = 1
+    while not watch.affords("program"):  # what was never begun must not be shut out for ever
+        tries += 1
+    assert 3 < tries < 30
+    assert Stopwatch(None, pace).affords("program")
+
+
+def test_so_many_ways_as_fit_in():
+    pace = Pace()
+    pace.learn("way", 0.1)
+    pace.learn("program", 0.2)
+    assert Stopwatch(1.0, pace).room("way", 16, then="program") in (6, 7)
+    assert Stopwatch(None, pace).room("way", 16, then="program") == 16
+    assert Stopwatch(0.15, pace).room("way", 16, then="program") == 0
+
+
+def slowed(monkeypatch, seconds):
+    run = active_set.ActiveSetSolver._run
+
+    def slow(self, *given):
+        time.sleep(seconds)
+        return run(self, *given)
+
+    monkeypatch.setattr(active_set.ActiveSetSolver, "_run", slow)
+
+
+def test_a_slow_solver_stops_the_search_and_is_counted(monkeypatch):
+    """Programs ten times as long as the deadline: one at most is begun, then none."""
+    mpc, step = MPC(problem(N), Settings(deadline=0.02)), closing(2.0)
+    for _ in range(3):
+        mpc.step(*step)
+    quick = mpc.overruns
+    slowed(monkeypatch, 0.2)
+    began = time.perf_counter()
+    late = mpc.step(*step)
+    assert time.perf_counter() - began < 0.5
+    assert mpc.overruns == quick + 1
+    assert late.candidates == ()
+    began = time.perf_counter()
+    known = mpc.step(*step)  # now it is known that programs take too long
+    assert time.perf_counter() - began < 0.1
+    assert known.status in (Status.PREVIOUS, Status.BRAKING)
+    assert mpc.counts[known.status] == 1
+    monkeypatch.undo()
+    for _ in range(60):
+        again = mpc.step(*step)
+    assert again.status is Status.CONVERGED  # and forgotten in time
+
+
+def test_a_computation_that_breaks_down_ends_on_the_ladder(monkeypatch, caplog):
+    mpc, step = MPC(problem(N)), closing(2.0)
+    first = mpc.step(*step)
+
+    def broken(*_):
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(active_set.ActiveSetSolver, "_run", broken)
+    plan = mpc.step(*step)
+    assert plan.status in (Status.PREVIOUS, Status.BRAKING)
+    assert "broke down" in caplog.text
+    monkeypatch.undo()
+    mpc.reset()
+    np.testing.assert_array_equal(mpc.step(*step).U, first.U)
+
+
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.1, 0.2), (-0.4, -0.05)])
+def test_from_within_the_set_the_robot_leaves_on_the_nearest_side_and_stays_out(inflation, offset):
+    """Semi-axes of 1.33 m and 0.6 m: the way out is along the second axis."""
+    case, goal = problem(15, inflation), np.zeros(4)
+    on_top = ObstaclePrediction(np.zeros((16, 2)), np.diag([0.16, 0.01]), 0.2)
+    mpc, x, tracks, slack = MPC(case), np.array([offset[0], 0.0, offset[1], 0.0]), [], []
+    for _ in range(25):
+        plan = mpc.step(x, goal, [on_top])
+        assert np.isfinite(plan.U).all()
+        slack.append(plan.slack.max())
+        x = case.model.step(x, plan.u0)
+        tracks.append(x[2])
+    outside = np.flatnonzero(np.array(slack) <= 1e-6)[0]
+    assert outside <= 3
+    assert max(slack[outside:]) <= 1e-6
+    assert (np.diff(slack[: outside + 1]) < 0).all()
+    assert len(set(np.sign(tracks))) == 1  # one side, without flicker
+    if offset[1]:
+        assert np.sign(tracks[0]) == np.sign(offset[1])
+
+
+def test_the_slack_is_the_least_there_is():
+    """From rest at the centre the robot is as far out at each stage as full throttle takes it."""
+    case, goal = problem(6), np.zeros(4)
+    on_top = ObstaclePrediction(np.zeros((7, 2)), 0.04 * np.eye(2), 0.2)
+    plan = SCP(case).solve(np.zeros(4), goal, [on_top])
+    assert plan.status is Status.SOFTENED
+    reach = 0.35 + case.size.reference * 0.2
+    t = DT * np.arange(1, 7)
+    best = np.sqrt(2) * 3.0 * t**2 / 2  # both inputs at their bounds
+    np.testing.assert_allclose(plan.slack[0, :2], (reach - best)[:2], atol=1e-6)
+
+
+def test_two_obstacles_that_close_the_way_stop_the_robot():
+    ref = straight_reference(20, 2.0)
+    walls = [
+        obstacle(20, (4.0, side * 1.0), covariance=np.diag([0.01, 0.09]), growth=0.0)
+        for side in (1, -1)
+    ]
+    mpc, x = MPC(problem(20, max_obstacles=2)), ref[0]
+    for _ in range(25):
+        plan = mpc.step(x, ref, walls)
+        assert plan.ok, plan.status
+        x = problem(20).model.step(x, plan.u0)
+
+
+def test_three_dimensions_brake_too():
+    space = {"model": DoubleIntegrator(DT, 3), "Q": [1.0, 0.1] * 3, "R": [0.1] * 3}
+    plan = SCP(problem(10, **space)).brake(np.array([0, 1.0, 0, -2.0, 0, 0.5]), np.zeros(6))
+    assert np.abs(plan.X[-1, 1::2]).max() < 1e-9
