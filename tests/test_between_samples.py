@@ -222,11 +222,12 @@ def test_certificate_and_optimum_agree_with_ipopt(seed, s_min, condense):
     assert step.sampling.count == 4
     z, cost, g = written_out(case, step)
     force = casadi.DM(-plan.multipliers.obstacles[0])
-    slope = casadi.Function("f", [z], [casadi.gradient(cost - force.T @ g, z), cost])
-    gradient, value = slope(np.append(plan.U.ravel(), plan.iterate.s))
+    slope = casadi.Function("f", [z], [casadi.gradient(cost - force.T @ g, z), cost, g])
+    gradient, value, constraint = slope(np.append(plan.U.ravel(), plan.iterate.s))
     bounds = np.append(plan.multipliers.inputs.ravel(), plan.multipliers.margin)
     assert np.abs(np.array(gradient).ravel() + bounds).max() < 1e-5
     assert float(value) == pytest.approx(plan.cost, rel=1e-9)
+    assert np.array(constraint).min() >= -1e-6
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
     solver = casadi.nlpsol("s", "ipopt", {"x": z, "f": cost, "g": g}, options)
     limits = np.full(2 * N, 3.0)
@@ -236,4 +237,4 @@ def test_certificate_and_optimum_agree_with_ipopt(seed, s_min, condense):
         ubx=np.append(limits, margin.upper),
         lbg=0.0,
     )
-    assert plan.cost == pytest.approx(float(end["f"]), rel=1e-5)
+    assert plan.cost <= float(end["f"]) * (1 + 1e-5)  # an interior point may leave for a worse one
