@@ -7,6 +7,7 @@ horizon     (a, c, e) a control step at N = 8 and N = 30, and among 5 and 12 obs
             IPOPT, Fatrop, CasADi's SQP with three QP solvers, SLSQP, and scp_mpc with each of its
             own QP solvers
 scaling     (b) closed loops over horizons 5 to 200 and 1 to 50 obstacles, with fitted exponents
+deadlines   closed loops among 12 obstacles with a deadline, and how late their steps end
 optimality  (d) plan costs against the best of 24 starts of IPOPT
 programs    QP solvers on recorded programs
 """

@@ -137,7 +137,8 @@ class Problem:
 
     def size_for(self, obstacles: int, count: int) -> float:
         """The uniform size s for so many obstacles, with `count` points in each interval."""
-        return size_at(self.margin, self.model.dim, obstacles, self.horizon, count)
+        gaps = self.subsamples > 1
+        return size_at(self.margin, self.model.dim, obstacles, self.horizon, count, gaps)
 
     def cost(
         self, states: FloatArray, inputs: FloatArray, s: FloatArray, x_ref: FloatArray

@@ -79,9 +79,11 @@ def test_the_bound_without_doubt_and_within_the_disc():
 
 def test_promises_become_sizes():
     def size(margin, obstacles=2, **changes):
-        return problem(10, margin=margin, max_obstacles=3, **changes).size_for(obstacles, 4)
+        values = {"max_obstacles": 3, "subsamples": 4, **changes}
+        return problem(10, margin=margin, **values).size_for(obstacles, 4)
 
-    assert size(StageRisk(0.05)) == pytest.approx(norm.isf(0.05 / 4))
+    assert size(StageRisk(0.05)) == pytest.approx(norm.isf(0.05 / 5))
+    assert problem(10, margin=StageRisk(0.05)).size_for(2, 1) == pytest.approx(norm.isf(0.05))
     assert size(JointRisk(0.05)) == pytest.approx(norm.isf(0.05 / (2 * 10 * 4)))
     assert size(Containment(0.95)) == pytest.approx(chi2.ppf(0.95, 2) ** 0.5)
     assert size(Margin(reference=2.0, lower=1.0)) == 2.0
@@ -137,8 +139,9 @@ def test_plans_commit_to_no_more_than_promised(delta, subsamples):
     for plan in (uniform, iterative):
         assert plan.ok
         assert plan.risk.joint <= delta * (1 + 1e-5)
-        assert plan.risk.joint == pytest.approx(plan.risk.stages.sum())
-        np.testing.assert_allclose(plan.risk.obstacles, plan.risk.stages.sum(axis=1))
+        assert plan.risk.joint == pytest.approx(plan.risk.obstacles.sum())
+        # Between the samples, the point that two intervals share counts for both.
+        assert (plan.risk.stages.sum(axis=1) >= plan.risk.obstacles * (1 - 1e-9)).all()
     # The allocation buys cost with risk that the uniform one left unused.
     assert uniform.risk.joint < 0.5 * delta
     assert iterative.risk.joint > 0.6 * delta

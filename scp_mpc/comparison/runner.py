@@ -7,13 +7,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from scp_mpc.comparison import horizon_timing, optimality, programs, scaling
+from scp_mpc.comparison import deadlines, horizon_timing, optimality, programs, scaling
 from scp_mpc.comparison.one_thread import in_one_thread
 from scp_mpc.comparison.scaling_figure import scaling_figure
 from scp_mpc.comparison.timing_table import measured_on
 from scp_mpc.provenance import provenance
 
-BENCHMARKS = ("horizon", "scaling", "optimality", "programs")
+BENCHMARKS = ("horizon", "scaling", "deadlines", "optimality", "programs")
 
 
 def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], None]) -> None:
@@ -38,6 +38,10 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], None]
         )
         _write(out, scaling.NAME, text, {"rows": table, "exponents": fitted}, echo)
         _save(scaling_figure(table, fitted), out / f"{scaling.NAME}.png")
+    elif name == "deadlines":
+        table = in_one_thread(deadlines.rows, steps)
+        _write(out, deadlines.NAME, deadlines.markdown(table), {"rows": table}, echo)
+        _save(deadlines.figure(table), out / f"{deadlines.NAME}.png")
     elif name == "optimality":
         table = in_one_thread(optimality.rows, steps, optimality.STARTS, seed)
         _write(out, optimality.NAME, optimality.markdown(table), {"rows": table}, echo)

@@ -79,7 +79,9 @@ class Containment:
 class StageRisk:
     """P(the robot touches obstacle j during (t_{i-1}, t_i]) <= delta, for each j and i.
 
-    s = Phi^-1(1 - delta / K): the K points of an interval share the risk equally (Boole).
+    s = Phi^-1(1 - delta / (K + 1)): the points of an interval, its beginning included, share the
+    risk equally (Boole), for touching anywhere between two points takes one of them too near. With
+    the samples alone it is P(the robot touches obstacle j at t_i), and s = Phi^-1(1 - delta).
 
     Attributes:
         delta: Largest risk per obstacle and stage, between 0 and 1/2.
@@ -92,13 +94,13 @@ class StageRisk:
         _require_risk("delta", self.delta)
 
     def size(self, points: int) -> float:
-        """The size s where an interval has that many points."""
+        """The size s where that many points share the risk of an interval."""
         return float(size_at_risk(self.delta / points))
 
 
 @dataclass(frozen=True)
 class JointRisk:
-    """P(the robot touches any obstacle within the horizon) <= delta.
+    """P(the robot touches any obstacle within the horizon) <= delta, if it is clear of them now.
 
     Attributes:
         delta: Largest risk of the whole plan, between 0 and 1/2.
@@ -126,7 +128,9 @@ class JointRisk:
 Promise = Margin | Containment | StageRisk | JointRisk
 
 
-def size_at(promise: Promise, dim: int, obstacles: int, stages: int, count: int) -> float:
+def size_at(
+    promise: Promise, dim: int, obstacles: int, stages: int, count: int, gaps: bool
+) -> float:
     """The uniform size s of a promise.
 
     Args:
@@ -135,13 +139,14 @@ def size_at(promise: Promise, dim: int, obstacles: int, stages: int, count: int)
         obstacles: J.
         stages: N.
         count: K.
+        gaps: Whether the promise covers what happens between two points.
     """
     if isinstance(promise, Margin):
         return promise.reference
     if isinstance(promise, Containment):
         return promise.size(dim)
     if isinstance(promise, StageRisk):
-        return promise.size(count)
+        return promise.size(count + gaps)
     return promise.size(obstacles * stages * count)
 
 

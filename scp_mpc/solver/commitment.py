@@ -19,10 +19,12 @@ class PlanRisk:
     """Upper bounds of the probability that the robot touches an obstacle if it follows the plan.
 
     They hold for the Gaussians that were predicted, with Boole's inequality over points, stages
-    and obstacles, and whatever the correlation between them.
+    and obstacles, whatever the correlation between them, and for a robot that is clear now. With
+    `subsamples=1` they are about the samples only.
 
     Attributes:
-        stages: (J, N) of touching obstacle j between samples i - 1 and i.
+        stages: (J, N) of touching obstacle j between samples i - 1 and i, which takes one of the
+            points there, the one at i - 1 included, too near.
         obstacles: (J,) of touching obstacle j at all.
         joint: Of touching any.
     """
@@ -43,6 +45,9 @@ def point_risks(step: StepData, path: FloatArray) -> FloatArray:
 
 def plan_risk(step: StepData, path: FloatArray) -> PlanRisk:
     """Add the bounds up."""
-    stages = step.sampling.stages(point_risks(step, path)).sum(axis=2)
-    whole = stages.sum(axis=1)
+    points = step.sampling.stages(point_risks(step, path))
+    whole = points.sum(axis=(1, 2))
+    stages = points.sum(axis=2)
+    if step.problem.subsamples > 1:
+        stages[:, 1:] += points[:, :-1, -1]
     return PlanRisk(np.minimum(stages, 1.0), np.minimum(whole, 1.0), min(1.0, float(whole.sum())))
