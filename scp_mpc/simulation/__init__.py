@@ -1,7 +1,7 @@
 """Simulation: named scenarios, the closed loop, obstacles drawn from predictions, contact."""
 
 from scp_mpc.simulation.closed_loop import ClosedLoop, simulate
-from scp_mpc.simulation.contact import contacts, robot_path
+from scp_mpc.simulation.contact import contacts, robot_path, sampled_contacts
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance
 from scp_mpc.simulation.realisations import COUPLINGS, applicable_couplings, sample_paths
@@ -20,5 +20,6 @@ __all__ = [
     "contacts",
     "robot_path",
     "sample_paths",
+    "sampled_contacts",
     "simulate",
 ]

@@ -84,6 +84,18 @@ def contacts(path: FloatArray, obstacles: FloatArray, radius: float) -> BoolArra
     return touched
 
 
+def sampled_contacts(path: FloatArray, obstacles: FloatArray, radius: float) -> BoolArray:
+    """Whether (n, N) the discs touch at the end of interval i: what the samples alone show.
+
+    Args:
+        path: As in `contacts`.
+        obstacles: As in `contacts`.
+        radius: Sum of both radii [m].
+    """
+    there: BoolArray = np.square(path[:, -1] - obstacles[:, 1:]).sum(axis=-1) <= radius**2
+    return there
+
+
 def _smallest_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     """Smallest distances (...) of the segments a -> b (..., d) from the origin."""
     e = b - a
