@@ -1,4 +1,4 @@
-"""Promised against measured risk on logarithmic axes, with the diagonal between them."""
+"""Promised against measured risk on logarithmic axes, with a step where each promise ends."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,7 +22,8 @@ _MARKERS = {
     "report": "*",
 }
 _KINDS = tuple(_MARKERS)
-_SPREAD = 1.045  # factor between neighbours that promise the same
+_MISTAKE = "#000000"  # of what promises nothing between the samples
+_SPREAD = 1.065  # factor between neighbours that promise the same
 _FLOOR = 2e-5
 
 
@@ -52,23 +53,29 @@ def _panel(axes: Axes, rows: Sequence[Row]) -> None:
     shown = [row for row in rows if "measured" in row]
     deltas = sorted({row["delta"] for row in shown})
     span = np.array([min(deltas) / 1.8, max(deltas) * 1.8])
-    floor = min([_FLOOR * 5, *(row["high"] / 2 for row in shown)])
-    axes.fill_between(span, span, 1.0, color="#999999", alpha=0.15, linewidth=0)
-    axes.plot(span, span, color="black", linewidth=1.5, label="promise: measured = promised")
+    floor = max(_FLOOR, min([1e-4, *(row["high"] / 2 for row in shown)]))
+    axes.plot(span, span, color="black", linewidth=1.0, linestyle=":", label="diagonal")
     series = {(row["inflation"], row["kind"]) for row in shown}
     ordered = [(i, k) for i in _COLOURS for k in _KINDS if (i, k) in series]
+    width = _SPREAD ** (len(ordered) / 2)
+    for at, delta in enumerate(deltas):  # neighbours stand aside of the diagonal: a step for each
+        step = np.array([delta / width, delta * width])
+        label = "promise: at most delta" if at == 0 else None
+        axes.fill_between(step, delta, 1.2, color="#999999", alpha=0.15, linewidth=0)
+        axes.plot(step, [delta, delta], color="black", linewidth=2.0, label=label)
     for place, (inflation, kind) in enumerate(ordered):
         part = [row for row in shown if (row["inflation"], row["kind"]) == (inflation, kind)]
         shift = _SPREAD ** (place - (len(ordered) - 1) / 2)
         measured = np.array([row["measured"] for row in part])
         ends = np.array([[row["low"], row["high"]] for row in part]).T
+        color = _MISTAKE if kind == "samples only" else _COLOURS[inflation]
         axes.errorbar(
             [shift * row["delta"] for row in part],
             np.maximum(measured, floor),
             yerr=np.abs(np.maximum(ends, floor) - np.maximum(measured, floor)),
-            color=_COLOURS[inflation],
+            color=color,
             marker=_MARKERS[kind],
-            markerfacecolor=_COLOURS[inflation] if inflation == "exact" else "white",
+            markerfacecolor="white" if inflation == "axes" else color,
             markersize=14 if kind == "report" else 9,
             markeredgewidth=1.8,
             elinewidth=1.8,
@@ -90,7 +97,7 @@ def _panel(axes: Axes, rows: Sequence[Row]) -> None:
     axes.text(
         0.03,
         0.97,
-        "promise broken",
+        "grey: promise broken",
         transform=axes.transAxes,
         fontsize=13,
         va="top",
