@@ -11,7 +11,6 @@ from scp_mpc import (
     CovarianceError,
     DoubleIntegrator,
     InvalidArgumentError,
-    LinearModel,
     ObstaclePrediction,
     ReportPredictor,
     ShapeError,
@@ -197,6 +196,3 @@ def test_contact_refuses_what_does_not_fit():
         contacts(path[:, :1], np.zeros((5, 4, 2)), 0.1)
     with pytest.raises(BoundsError, match=r"-0\.1 m"):
         contacts(path, np.zeros((5, 4, 2)), -0.1)
-    other = LinearModel(np.eye(2), np.eye(2), 0.2, np.array([0, 1]))
-    with pytest.raises(InvalidArgumentError, match="between the samples"):
-        robot_path(other, np.zeros((3, 2)), np.zeros((2, 2)))

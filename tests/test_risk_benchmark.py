@@ -22,7 +22,7 @@ from scp_mpc.comparison.risk_table import markdown
 from scp_mpc.simulation import applicable_couplings
 
 SAMPLES = 2000
-NAMES = ("escort", "turned", "beside")
+NAMES = ("escort", "turned", "diagonal")
 
 
 def few():
@@ -50,8 +50,9 @@ def test_exact_is_not_broken_and_axes_is(rows):
     assert exact["broken_in"] == []
     # The bound is nearly reached: the table does not flatter itself with easy scenes.
     assert exact["measured"] > 0.8 * 0.05
-    assert (axes["verdict"], axes["scene"]) == ("broken", "turned")
-    assert axes["measured"] > 2 * 0.05
+    assert axes["verdict"] == "broken"
+    assert axes["broken_in"] == ["turned", "diagonal"]
+    assert axes["measured"] > 1.8 * 0.05
     for name in ("joint, uniform", "joint, iterative", "containment"):
         assert rows[f"{name}, exact, 0.05"]["verdict"] == "kept"
 
@@ -166,9 +167,8 @@ def test_every_scene_is_shaped_by_its_obstacles():
         solver = SCP(problem)
         plan = solver.solve(scene.x0, scene.x_ref, scene.obstacles)
         assert plan.ok
-        if scene.name != "needle":  # which no sample sees
-            free = solver.solve(scene.x0, scene.x_ref)
-            assert np.abs(plan.X - free.X).max() > 1e-3, scene.name
+        free = solver.solve(scene.x0, scene.x_ref)
+        assert np.abs(plan.X - free.X).max() > 1e-3, scene.name
     first, second = all_scenes(0)[0], all_scenes(1)[0]
     assert not np.array_equal(first.x0, second.x0)
 

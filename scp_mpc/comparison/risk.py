@@ -205,7 +205,7 @@ def _measured(setting: RiskSetting, draws: _Draws) -> Row:
         "ok": plan.ok,
         "status": plan.status.name,
         "cost": plan.cost,
-        "s": [float(s) for s in plan.s],
+        "committed": plan.risk.joint if setting.joint else float(plan.risk.stages.max()),
     }
     if not plan.ok:
         return row

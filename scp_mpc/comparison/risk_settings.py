@@ -17,8 +17,9 @@ from scipy.stats import chi2, norm
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.problem import Margin, Problem
+from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel
+from scp_mpc.safety.margin import Containment, JointRisk, Margin, Promise, StageRisk
 from scp_mpc.settings import require_positive
 
 DELTAS = (0.1, 0.05, 0.01)
@@ -99,23 +100,33 @@ def problem_for(
         "R": [0.001] * model.dim,
         "u_min": -3.0,
         "u_max": 3.0,
-        "margin": _margin(setting, horizon * obstacles, model.dim),
+        "margin": _promise(setting, horizon * obstacles, model.dim),
         "inflation": setting.inflation,
         "max_obstacles": obstacles,
     }
-    if setting.kind == "samples only" and "subsamples" in Problem.__dataclass_fields__:
+    if setting.kind in ("samples only", "report"):
         values["subsamples"] = 1
     return Problem(model, **(values | given))
 
 
-def _margin(setting: RiskSetting, shares: int, dim: int) -> Margin:
+def _promise(setting: RiskSetting, shares: int, dim: int) -> Promise:
+    if setting.scale != 1:
+        return Margin.fixed(setting.scale * _size(setting, shares, dim))
     if setting.kind == "report":
-        return _fixed(setting.scale * _REPORT[0].reference)
+        return _REPORT[0]
     if setting.kind == "containment":
-        return _fixed(setting.scale * float(chi2.isf(setting.delta, dim)) ** 0.5)
-    share = setting.delta / shares if setting.joint else setting.delta
-    return _fixed(setting.scale * float(norm.isf(share)))
+        return Containment(1 - setting.delta)
+    if setting.kind == "joint, uniform":
+        return JointRisk(setting.delta, "uniform")
+    if setting.kind == "joint, iterative":
+        return JointRisk(setting.delta, "iterative")
+    return StageRisk(setting.delta)
 
 
-def _fixed(s: float) -> Margin:
-    return Margin(reference=s, lower=s, upper=max(10.0, s))
+def _size(setting: RiskSetting, shares: int, dim: int) -> float:
+    """The size s of the promise at the samples, for the deliberate mistake."""
+    if setting.kind == "report":
+        return _REPORT[0].reference
+    if setting.kind == "containment":
+        return float(chi2.isf(setting.delta, dim)) ** 0.5
+    return float(norm.isf(setting.delta / shares if setting.joint else setting.delta))

@@ -21,11 +21,12 @@ Notation:
     r                   sum of both radii [m]
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, as_array, as_number
-from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
-from scp_mpc.robots.double_integrator import DoubleIntegrator
+from scp_mpc.errors import BoundsError, ShapeError
 from scp_mpc.robots.linear import LinearModel
 
 FINE = 32  # pieces of an interval; at 3 m/s^2 and 0.2 s they are within 0.02 mm of the curve
@@ -41,9 +42,7 @@ def robot_path(model: LinearModel, states: FloatArray, inputs: FloatArray) -> Fl
         inputs: (N, nu), each held over its interval.
     """
     path = [states[:-1, model.position]]
-    for k in range(1, FINE):
-        C, D = _between(model, k / FINE)
-        path.append(states[:-1] @ C.T + inputs @ D.T)
+    path += [states[:-1] @ C.T + inputs @ D.T for C, D in _pieces(model)]
     path.append(states[1:, model.position])
     return np.stack(path, axis=1)
 
@@ -96,6 +95,12 @@ def sampled_contacts(path: FloatArray, obstacles: FloatArray, radius: float) -> 
     return there
 
 
+@lru_cache(maxsize=16)
+def _pieces(model: LinearModel) -> list[tuple[FloatArray, FloatArray]]:
+    """(C, D) with position C x + D u after each piece of an interval but the last."""
+    return [model.between(k / FINE) for k in range(1, FINE)]
+
+
 def _smallest_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     """Smallest distances (...) of the segments a -> b (..., d) from the origin."""
     e = b - a
@@ -105,11 +110,3 @@ def _smallest_distance(a: FloatArray, b: FloatArray) -> FloatArray:
     t = np.clip(-along / np.maximum(square, np.finfo(np.float64).tiny), 0.0, 1.0)
     nearest = [a[..., k] + t * e[..., k] for k in axes]
     return np.sqrt(sum((x * x for x in nearest), start=np.zeros(a.shape[:-1])))
-
-
-def _between(model: LinearModel, fraction: float) -> tuple[FloatArray, FloatArray]:
-    """(C, D) with position C x + D u at a fraction of an interval."""
-    if not isinstance(model, DoubleIntegrator):
-        raise InvalidArgumentError("model", f"no path between the samples of {model!r} is known")
-    short = DoubleIntegrator(fraction * model.dt, model.dim)
-    return short.A[short.position], short.B[short.position]
