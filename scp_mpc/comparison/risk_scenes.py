@@ -2,8 +2,8 @@
 
 Some are everyday encounters; the others are where a promise is hardest to keep:
 
-    escort      small errors against large radii, side by side at equal, low speed: the robot rests at
-                its half-space, whose bound is then nearly reached
+    escort      small errors against large radii, side by side at equal, low speed: the robot
+                rests at its half-space, whose bound is then nearly reached
     wandering   the same with errors that grow quickly: contact at one sample and at the next are
                 different events
     round       as `escort`, but going round an obstacle at rest
@@ -84,7 +84,7 @@ def all_scenes(seed: int) -> list[Scene]:
         ("wandering", 0.1, 0.65, 2.5, [_moving((0.0, -4.8), (0.1, 0.0), loose, 2.5, 1.0)]),
         ("round", 0.5, 0.0, 0.5, [_moving((1.2, -0.2), (0.0, 0.0), small, 0.5)]),
         ("turned", 0.1, 0.65, 0.5, [_moving((-0.2, -0.6), (0.1, 0.0), turned, 0.5)]),
-        ("diagonal", 0.5, 0.0, 0.4, [_moving((1.0, 0.9), (0.0, 0.0), diagonal, 0.4)]),
+        ("diagonal", 0.5, 0.0, 0.4, [_moving((1.25, 0.95), (0.0, 0.0), diagonal, 0.4)]),
         ("needle", 2.0, 0.0, 0.1, [_moving((3.0, 7.5), (0.0, -5.0), small, 0.05)]),
         (
             "gate",
