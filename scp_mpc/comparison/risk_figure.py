@@ -96,10 +96,10 @@ def _panel(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_xlabel("promised probability delta [1]", fontsize=14)
     axes.text(
         0.03,
-        0.97,
+        0.03,
         "grey: promise broken",
         transform=axes.transAxes,
         fontsize=13,
-        va="top",
+        va="bottom",
         color="#555555",
     )
