@@ -19,7 +19,7 @@ from scp_mpc.comparison.risk_settings import (
 )
 from scp_mpc.comparison.risk_store import RiskStore
 from scp_mpc.comparison.risk_table import markdown
-from scp_mpc.simulation import applicable_couplings
+from scp_mpc.simulation import applicable_couplings, contacts, robot_path
 
 SAMPLES = 2000
 NAMES = ("escort", "turned", "diagonal")
@@ -92,6 +92,27 @@ def test_what_passes_between_two_samples_is_counted():
     assert row["at_samples"] == 0.0
     assert row["measured"] > 0.9
     assert row["verdict"] == "broken"
+
+
+def test_a_joint_risk_counts_any_contact_with_any_obstacle():
+    scene = next(scene for scene in all_scenes(0) if scene.name == "gate")
+    setting = RiskSetting("joint, uniform", 0.1, "exact", scale=0.2)
+    row = risk.open_loop(2000, 0, [scene], [setting])[0]
+    given = (scene.model, HORIZON, 2)
+    plan = SCP(problem_for(setting, *given, robot_radius=scene.robot_radius)).solve(
+        scene.x0, scene.x_ref, scene.obstacles
+    )
+    path = robot_path(scene.model, plan.X, plan.U)
+    draws = risk._Draws(scene, 2000, 0)
+    largest = 0
+    for coupling in draws.couplings:
+        touched = [False] * 2000
+        for drawn, told in zip(draws.paths(coupling), scene.obstacles, strict=True):
+            for i, stages in enumerate(contacts(path, drawn, scene.robot_radius + told.radius)):
+                touched[i] = touched[i] or any(stages)
+        largest = max(largest, sum(touched))
+    assert 0.05 < row["measured"] < 0.95
+    assert row["measured"] == largest / 2000
 
 
 def test_a_scene_without_a_plan_is_counted_not_measured():
