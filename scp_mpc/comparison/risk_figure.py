@@ -41,7 +41,7 @@ def risk_figure(opened: Sequence[Row], closed: Sequence[Row] = ()) -> Figure:
     panels[0].set_title("open loop: the worst scene", fontsize=14)
     panels[0].set_ylabel("measured probability of contact [1]", fontsize=14)
     if closed:
-        _panel(panels[1], closed)
+        _panel(panels[1], closed, promised=False)
         panels[1].set_title("closed loop: episodes in contact (not promised)", fontsize=14)
         panels[1].set_ylabel("share of episodes with contact [1]", fontsize=14)
     handles, labels = panels[0].get_legend_handles_labels()
@@ -49,7 +49,7 @@ def risk_figure(opened: Sequence[Row], closed: Sequence[Row] = ()) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, rows: Sequence[Row]) -> None:
+def _panel(axes: Axes, rows: Sequence[Row], promised: bool = True) -> None:
     shown = [row for row in rows if "measured" in row]
     deltas = sorted({row["delta"] for row in shown})
     span = np.array([min(deltas) / 1.8, max(deltas) * 1.8])
@@ -58,7 +58,9 @@ def _panel(axes: Axes, rows: Sequence[Row]) -> None:
     series = {(row["inflation"], row["kind"]) for row in shown}
     ordered = [(i, k) for i in _COLOURS for k in _KINDS if (i, k) in series]
     width = _SPREAD ** (len(ordered) / 2)
-    for at, delta in enumerate(deltas):  # neighbours stand aside of the diagonal: a step for each
+    for at, delta in enumerate(
+        deltas if promised else []
+    ):  # neighbours stand aside of the diagonal: a step for each
         step = np.array([delta / width, delta * width])
         label = "promise: at most delta" if at == 0 else None
         axes.fill_between(step, delta, 1.2, color="#999999", alpha=0.15, linewidth=0)
@@ -94,12 +96,13 @@ def _panel(axes: Axes, rows: Sequence[Row]) -> None:
     axes.tick_params(labelsize=13)
     axes.grid(alpha=0.3)
     axes.set_xlabel("promised probability delta [1]", fontsize=14)
-    axes.text(
-        0.03,
-        0.03,
-        "grey: promise broken",
-        transform=axes.transAxes,
-        fontsize=13,
-        va="bottom",
-        color="#555555",
-    )
+    if promised:
+        axes.text(
+            0.03,
+            0.03,
+            "grey: promise broken",
+            transform=axes.transAxes,
+            fontsize=13,
+            va="bottom",
+            color="#555555",
+        )
