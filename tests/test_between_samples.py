@@ -93,9 +93,10 @@ def test_slow_robots_are_constrained_at_the_samples_alone():
     case = problem(N, subsamples=4)
     for speed, points in ((1.0, N), (4.0, 4 * N)):
         ref = straight_reference(N, speed)
-        ahead = [obstacle(N, (0.6 * speed * N * DT, 0.1))]
-        plan = SCP(case).solve(ref[0], ref, ahead)
+        beside = [obstacle(N, (0.6 * speed * N * DT, 0.7))]
+        plan = SCP(case).solve(ref[0], ref, beside)
         assert plan.status is Status.CONVERGED
+        assert plan.iterate.touches
         assert plan.iterate.slack.shape == (1, points)
         assert plan.slack.shape == (1, N)
 
@@ -216,7 +217,8 @@ def test_certificate_and_optimum_agree_with_ipopt(seed, s_min, condense):
     ref = straight_reference(N, 4.0)
     Sigma = rotated((0.25, 0.1), rng.uniform(0, np.pi))
     ahead = obstacle(N, (5.0, rng.uniform(-0.3, 0.3)), (0.5, rng.uniform(-0.1, 0.1)), Sigma)
-    plan = SCP(case, Settings(condense=condense)).solve(ref[0], ref, [ahead])
+    patient = Settings(condense=condense, max_iterations=200)
+    plan = SCP(case, patient).solve(ref[0], ref, [ahead])
     assert plan.status is Status.CONVERGED
     step = plan.commitment.args[0]
     assert step.sampling.count == 4

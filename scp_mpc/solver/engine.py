@@ -40,6 +40,7 @@ class Engine:
             CondensedSCP.of(problem, settings, self.sampling) if settings.condense else None
         )
         self._fresh = False
+        self._full_sag = _full_sag(problem, count)
 
     @cached_property
     def sparse(self) -> SparseSCP:
@@ -87,6 +88,11 @@ class Engine:
         """What an iterate does between its points."""
         return Sweep.of(np.concatenate([self._step.track[:1], self.path(iterate)]))
 
+    def assumed(self, start: Iterate) -> Sweep:
+        """What a plan found from an iterate is assumed to do there, at full input at most."""
+        known = self.free_sweep().and_more(self.sweep(start))
+        return Sweep(known.chord, max(known.sag, self._full_sag))
+
     def free_sweep(self) -> Sweep:
         """What the plan that ignores the obstacles does between its points."""
         return Sweep.of(np.concatenate([self._step.track[:1], self.free_path()]))
@@ -131,3 +137,11 @@ class Engine:
         if best is None or other is None:
             return best or other
         return other if other.beats(best, lead=0.0) else best
+
+
+def _full_sag(problem: Problem, count: int) -> float:
+    """How far the largest inputs bend the path off its chord between two points [m]."""
+    _, half = problem.model.between(0.5 / count)
+    _, whole = problem.model.between(1.0 / count)
+    most = np.maximum(np.abs(problem.u_min), np.abs(problem.u_max))
+    return float(np.linalg.norm(np.abs(half - whole / 2) @ most))

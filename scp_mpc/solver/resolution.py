@@ -82,7 +82,7 @@ class Resolution:
         """What the plan is assumed to do between two points; None where that does not matter."""
         if not self._covers_gaps:
             return None
-        return engine.free_sweep().and_more(engine.sweep(start))
+        return engine.assumed(start)
 
     def widened(self, engine: Engine, step: StepData, sweep: Sweep | None) -> StepData:
         """Let an engine take the radii that this needs."""
@@ -100,9 +100,13 @@ class Resolution:
         depths = swept(step, moved).depths(engine.path(best.iterate), best.iterate.s)
         return bool(depths.max(initial=0.0) <= self._tolerance)
 
-    def corrected(self, engine: Engine, sweep: Sweep | None, best: Descent) -> Sweep | None:
-        """What to assume after a plan that was not kept."""
-        return None if sweep is None else engine.sweep(best.iterate).and_more(sweep)
+    def finer(self, engine: Engine, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData]:
+        """Where to go on after a plan that was not kept: between the samples, if not there yet."""
+        if engine is self.fine:
+            return engine, step
+        step = step.sampled(self.fine.sampling)
+        self.fine.begin(step, watch)
+        return self.fine, step
 
 
 def exposed(best: Descent) -> Descent:

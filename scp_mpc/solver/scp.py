@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 # A rival must be better by this share, or the plan flickers between sides of equal cost.
 _HYSTERESIS = 0.001
-_CORRECTIONS = 3  # of what was assumed about the motion between points
+_CORRECTIONS = 4  # of what was assumed about the motion between points
 _WARM_UP = 3  # steps
 _ROUNDS = 6  # of risk allocation at most
 _GAIN = 0.001  # share of the cost that makes another round worth while
@@ -168,9 +168,10 @@ class SCP:
             engine, step, free = self._resolution.refined(step, watch, last)
         if free is not None:
             return self._plan(step, _Found(free), watch, self._resolution.finished(engine))
-        start = engine.free() if last is None else last.resampled(engine.sampling.count)
-        sweep = self._resolution.assumed(engine, start)
+        start = engine.free() if last is None else last
         for _ in range(_CORRECTIONS):
+            start = start.resampled(engine.sampling.count)
+            sweep = self._resolution.assumed(engine, start)
             wide = self._resolution.widened(engine, step, sweep)
             found = _Found(engine.descend(start) or self._ladder.resort(wide, last))
             if self._contested(found.best, challenge):
@@ -181,7 +182,7 @@ class SCP:
             if self._resolution.kept(engine, step, sweep, found.best):
                 break
             start = found.best.iterate
-            sweep = self._resolution.corrected(engine, sweep, found.best)
+            engine, step = self._resolution.finer(engine, step, watch)
         else:
             found = replace(found, best=exposed(found.best))
         plan = self._plan(wide, found, watch, self._resolution.finished(engine))

@@ -21,7 +21,7 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.solver.step_data import StepData
 
 _SIGMAS = 3.0
-_RESERVE = 1.1  # of what is assumed about a plan over what is known of the one before
+_RESERVE = 1.2  # of what is assumed about a plan over what is known of the one before
 
 
 @dataclass(frozen=True)
