@@ -14,7 +14,7 @@ Where the robot is fast, constraints hold at points between the samples, too (`r
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from threading import Lock
 
@@ -25,31 +25,24 @@ from scp_mpc.arrays import frozen
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.allocation import reallocated
-from scp_mpc.safety.margin import JointRisk
-from scp_mpc.safety.risk import size_at_risk
 from scp_mpc.settings import Settings
-from scp_mpc.solver.commitment import plan_risk, point_risks
-from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.allocate import allocate
+from scp_mpc.solver.challenge import Challenge, Found
+from scp_mpc.solver.commitment import plan_risk
 from scp_mpc.solver.engine import Engine
 from scp_mpc.solver.guess import as_iterate
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.ladder import Ladder
-from scp_mpc.solver.plan import Candidate, Plan, Status, Timing
+from scp_mpc.solver.plan import Plan, Status, Timing
 from scp_mpc.solver.resolution import Resolution, exposed
-from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Pace, Stopwatch
 from scp_mpc.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
-# A rival must be better by this share, or the plan flickers between sides of equal cost.
-_HYSTERESIS = 0.001
 _CORRECTIONS = 4  # of what was assumed about the motion between points
 _WARM_UP = 3  # steps
-_ROUNDS = 6  # of risk allocation at most
-_GAIN = 0.001  # share of the cost that makes another round worth while
 
 
 class SCP:
@@ -68,6 +61,7 @@ class SCP:
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
         self._busy, self._pace = Lock(), Pace()
         self._resolution = Resolution(problem, self.settings)
+        self._challenge = Challenge(problem, self.settings)
         self._ladder = Ladder(problem, self.settings.tolerance)
         if self.settings.deadline is not None:
             self._warm_up()
@@ -121,7 +115,8 @@ class SCP:
                 return self._solve(step, watch, nominal, challenge)
             except (ArithmeticError, np.linalg.LinAlgError):
                 _log.exception("a computation broke down: the last plan, or braking")
-                found = _Found(self._ladder.resort(step, nominal() if nominal else None))
+                self.forget()
+                found = Found(self._ladder.resort(step, nominal() if nominal else None))
                 return self._plan(step, found, watch, {})
         finally:
             self._busy.release()
@@ -130,7 +125,7 @@ class SCP:
         """Bring the robot to rest at the model's limits, whatever is in the way."""
         watch = Stopwatch()
         step = StepData.read(self.problem, x0, x_ref, ())
-        found = _Found(self._ladder.brake(step, status))
+        found = Found(self._ladder.brake(step, status))
         return self._plan(step, found, watch, {})
 
     def stopwatch(self) -> Stopwatch:
@@ -167,16 +162,16 @@ class SCP:
             last = None if nominal is None else nominal()
             engine, step, free = self._resolution.refined(step, watch, last)
         if free is not None:
-            return self._plan(step, _Found(free), watch, self._resolution.finished(engine))
+            return self._plan(step, Found(free), watch, self._resolution.finished(engine))
         start = engine.free() if last is None else last
         for _ in range(_CORRECTIONS):
             start = start.resampled(engine.sampling.count)
             sweep = self._resolution.assumed(engine, start)
             wide = self._resolution.widened(engine, step, sweep)
-            found = _Found(engine.descend(start) or self._ladder.resort(wide, last))
-            if self._contested(found.best, challenge):
-                found = self._challenge(engine, wide, watch, found.best)
-            found = self._allocate(engine, wide, watch, found)
+            found = Found(engine.descend(start) or self._ladder.resort(wide, last))
+            if self._challenge.wanted(found.best, challenge):
+                found = self._challenge.run(engine, wide, watch, found.best)
+            found = replace(found, best=allocate(engine, wide, watch, found.best))
             ending = watch.elapsed
             found = self._rescue(engine, wide, last, found)
             if self._resolution.kept(engine, step, sweep, found.best):
@@ -189,68 +184,7 @@ class SCP:
         watch.learn("ending", ending)
         return plan
 
-    def _contested(self, best: Descent, challenge: bool) -> bool:
-        """Whether other ways past the obstacles are worth a look."""
-        wanted = not best.status.ok or (challenge and best.iterate.touches)
-        return self.settings.sides and wanted
-
-    def _challenge(
-        self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent
-    ) -> "_Found":
-        """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        most = watch.room("way", MAX_CANDIDATES, then="first program")
-        if not most:
-            return _Found(best)
-        began = watch.elapsed
-        full = np.full(self.problem.max_obstacles, self.problem.size.reference)
-        here = Passing(engine.path(best.iterate), best.iterate.touched[: step.count])
-        sides = candidates(step, engine.free_path(), here.path, full, most)
-        present = replace(best.iterate, s=full)
-        safe = best.status.ok
-        starts = engine.glimpses(present, [side.path for side in sides], firm=safe)
-        watch.learn("way", began, len(sides))
-        tried = tuple(
-            Candidate(side.obstacle, side.normal, side.time, start.merit)
-            for side, start in zip(sides, starts, strict=False)  # none if they are too many
-        )
-        goal, switched = best, False
-        ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
-        # A plan with slack is followed by any without: then all ways are worth their time.
-        for start in ranked[: self.settings.rivals] if safe else ranked:
-            if (not safe and goal.status.ok) or not watch.affords("first program"):
-                break
-            if safe and same_way(step, Passing(start.path, start.touched), here):
-                continue  # this way leads to where we are
-            rival = engine.follow(start.iterate, goal)
-            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
-                goal, switched = rival, True
-        return _Found(goal, tried, switched)
-
-    def _allocate(
-        self, engine: Engine, step: StepData, watch: Stopwatch, found: "_Found"
-    ) -> "_Found":
-        """Iterative risk allocation: the plan stays feasible, so that its cost cannot rise."""
-        margin, best = self.problem.margin, found.best
-        if not isinstance(margin, JointRisk) or margin.allocation == "uniform":
-            return found
-        allocated = np.full(step.radii.shape, margin.delta / step.radii.size)
-        for _ in range(_ROUNDS):
-            if not (best.status.ok and best.iterate.touches and watch.affords("first program")):
-                break
-            wanted = reallocated(allocated, point_risks(step, engine.path(best.iterate)))
-            engine.widen(step.scaled(size_at_risk(wanted)))
-            other = engine.descend(best.iterate)
-            if other is None or not other.beats(best, 0.0):
-                break
-            gain, best, allocated = best.merit - other.merit, other, wanted
-            if gain <= _GAIN * best.merit:
-                break
-        engine.widen(step)
-        return replace(found, best=best)
-
-    def _rescue(
-        self, engine: Engine, step: StepData, last: Iterate | None, found: "_Found"
-    ) -> "_Found":
+    def _rescue(self, engine: Engine, step: StepData, last: Iterate | None, found: Found) -> Found:
         """Without a plan that meets every constraint: descend from one that does, if known."""
         if found.best.status.ok or found.best.status is Status.FALLBACK:
             return found
@@ -260,9 +194,7 @@ class SCP:
         better = engine.descend(known.iterate)
         return replace(found, best=better if better and better.status.ok else known)
 
-    def _plan(
-        self, step: StepData, found: "_Found", watch: Stopwatch, qps: Mapping[str, int]
-    ) -> Plan:
+    def _plan(self, step: StepData, found: Found, watch: Stopwatch, qps: Mapping[str, int]) -> Plan:
         best, inside = found.best, watch.inside.seconds
         iterate = best.iterate
         path = step.sampling.positions(iterate.states, iterate.inputs)
@@ -288,12 +220,3 @@ class SCP:
             iterate=iterate,
             commitment=partial(plan_risk, step, path),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """The best plan, the rivals that were tried, and whether one of them won."""
-
-    best: Descent
-    tried: tuple[Candidate, ...] = ()
-    switched: bool = False

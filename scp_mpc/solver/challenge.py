@@ -1,0 +1,77 @@
+"""The challenge: other ways past the obstacles against the plan that is there.
+
+All ways are ranked by one program each; the best is followed to its end, and wins if it is better
+by enough. Where the plan needs slack, all are followed until one does not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
+from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.engine import Engine
+from scp_mpc.solver.plan import Candidate
+from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
+from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
+
+# A rival must be better by this share, or the plan flickers between sides of equal cost.
+_HYSTERESIS = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best plan so far, the rivals that were tried, and whether one of them won."""
+
+    best: Descent
+    tried: tuple[Candidate, ...] = ()
+    switched: bool = False
+
+
+class Challenge:
+    """Tries other ways past the obstacles.
+
+    Args:
+        problem: What to solve.
+        settings: Whether to try them, and how many to follow.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings) -> None:
+        """Remember both."""
+        self._problem, self._settings = problem, settings
+
+    def wanted(self, best: Descent, due: bool) -> bool:
+        """Whether to try: the plan is not safe, or it is time to and an obstacle shapes it."""
+        return self._settings.sides and (not best.status.ok or (due and best.iterate.touches))
+
+    def run(self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent) -> Found:
+        """Rank the ways past the obstacles by one program each; descend from the best of them."""
+        most = watch.room("way", MAX_CANDIDATES, then="first program")
+        if not most:
+            return Found(best)
+        began = watch.elapsed
+        full = np.full(self._problem.max_obstacles, self._problem.size.reference)
+        here = Passing(engine.path(best.iterate), best.iterate.touched[: step.count])
+        sides = candidates(step, engine.free_path(), here.path, full, most)
+        present = replace(best.iterate, s=full)
+        safe = best.status.ok
+        starts = engine.glimpses(present, [side.path for side in sides], firm=safe)
+        watch.learn("way", began, len(sides))
+        tried = tuple(
+            Candidate(side.obstacle, side.normal, side.time, start.merit)
+            for side, start in zip(sides, starts, strict=False)  # none if they are too many
+        )
+        goal, switched = best, False
+        ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
+        # A plan with slack is followed by any without: then all ways are worth their time.
+        for start in ranked[: self._settings.rivals] if safe else ranked:
+            if (not safe and goal.status.ok) or not watch.affords("first program"):
+                break
+            if safe and same_way(step, Passing(start.path, start.touched), here):
+                continue  # this way leads to where we are
+            rival = engine.follow(start.iterate, goal)
+            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = rival, True
+        return Found(goal, tried, switched)
