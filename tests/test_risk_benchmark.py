@@ -34,6 +34,8 @@ def rows():
     settings = [
         RiskSetting("stage", 0.05, "exact"),
         RiskSetting("stage", 0.05, "axes"),
+        RiskSetting("sample", 0.05, "exact"),
+        RiskSetting("sample", 0.05, "axes"),
         RiskSetting("stage", 0.05, "exact", scale=0.5),
         RiskSetting("joint, uniform", 0.05, "exact"),
         RiskSetting("joint, iterative", 0.05, "exact"),
@@ -45,7 +47,8 @@ def rows():
 
 
 def test_exact_is_not_broken_and_axes_is(rows):
-    exact, axes = rows["stage, exact, 0.05"], rows["stage, axes, 0.05"]
+    assert rows["stage, exact, 0.05"]["verdict"] == "kept"
+    exact, axes = rows["sample, exact, 0.05"], rows["sample, axes, 0.05"]
     assert exact["verdict"] != "broken"
     assert exact["broken_in"] == []
     # The bound is nearly reached: the table does not flatter itself with easy scenes.
@@ -53,6 +56,12 @@ def test_exact_is_not_broken_and_axes_is(rows):
     assert axes["verdict"] == "broken"
     assert axes["broken_in"] == ["turned", "diagonal"]
     assert axes["measured"] > 1.8 * 0.05
+    # Between the samples the points of an interval share the risk, which makes up for some of it.
+    assert (
+        axes["measured"]
+        > rows["stage, axes, 0.05"]["measured"]
+        > rows["stage, exact, 0.05"]["measured"]
+    )
     for name in ("joint, uniform", "joint, iterative", "containment"):
         assert rows[f"{name}, exact, 0.05"]["verdict"] == "kept"
 
@@ -169,7 +178,8 @@ def test_the_same_seed_gives_the_same_rows_and_promises_share_realisations():
     assert first == again
     both = risk.open_loop(500, 1, few()[:1], [RiskSetting("stage", 0.1, "exact"), *setting])
     assert both[1] == first[0]
-    assert risk.open_loop(500, 2, few()[:1], setting) != first
+    # Starts and futures are others; the counts may be the same by chance.
+    assert risk.open_loop(500, 2, few()[:1], setting)[0]["scenes"] != first[0]["scenes"]
 
 
 def test_intervals_are_those_of_clopper_and_pearson():
@@ -195,7 +205,7 @@ def test_every_scene_is_shaped_by_its_obstacles():
 
 
 def test_promises_are_checked():
-    assert len(all_settings()) == 2 * 4 * 3 + 3 + 1
+    assert len(all_settings()) == 2 * 5 * 3 + 3 + 1
     assert {setting.kind for setting in all_settings()} == set(KINDS)
     assert len(driven_settings()) == 4 * 3 + 3 + 1
     with pytest.raises(InvalidArgumentError, match="'hope' is none of"):

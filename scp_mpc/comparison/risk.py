@@ -5,6 +5,7 @@ predictions that the plan was made with, by every coupling of their stages that 
 (`scp_mpc.simulation.realisations`), and contact is counted, swept between the samples
 (`scp_mpc.simulation.contact`). What is measured is what was promised:
 
+    sample                          the largest frequency over i and j of contact with j at t_i
     stage, containment, ...         the largest frequency over stages i and obstacles j of contact
                                     with j in (t_{i-1}, t_i]
     joint                           the frequency of any contact over horizon and obstacles
@@ -215,10 +216,11 @@ def _measured(setting: RiskSetting, draws: _Draws) -> Row:
 
 
 def _counts(setting: RiskSetting, scene: Scene, plan: Plan, paths: list[FloatArray]) -> Row:
-    """Realisations that touch: swept, and what the samples alone would have shown."""
+    """Realisations that touch, as promised, and what the samples alone would have shown."""
     path = robot_path(scene.model, plan.X, plan.U)
     found = {}
-    for name, touch in (("count", contacts), ("at_samples", sampled_contacts)):
+    swept = sampled_contacts if setting.kind == "sample" else contacts
+    for name, touch in (("count", swept), ("at_samples", sampled_contacts)):
         touched = [
             touch(path, o, scene.robot_radius + told.radius)
             for o, told in zip(paths, scene.obstacles, strict=True)

@@ -15,6 +15,7 @@ Row = dict[str, Any]
 _COLOURS = {"exact": "#0072B2", "axes": "#D55E00"}
 _MARKERS = {
     "stage": "o",
+    "sample": "v",
     "samples only": "X",
     "joint, uniform": "s",
     "joint, iterative": "D",
@@ -58,9 +59,8 @@ def _panel(axes: Axes, rows: Sequence[Row], promised: bool = True) -> None:
     series = {(row["inflation"], row["kind"]) for row in shown}
     ordered = [(i, k) for i in _COLOURS for k in _KINDS if (i, k) in series]
     width = _SPREAD ** (len(ordered) / 2)
-    for at, delta in enumerate(
-        deltas if promised else []
-    ):  # neighbours stand aside of the diagonal: a step for each
+    # Neighbours stand aside of the diagonal: a step for each.
+    for at, delta in enumerate(deltas if promised else []):
         step = np.array([delta / width, delta * width])
         label = "promise: at most delta" if at == 0 else None
         axes.fill_between(step, delta, 1.2, color="#999999", alpha=0.15, linewidth=0)

@@ -1,6 +1,9 @@
 """The promises that are put to the test: a kind of risk, delta, and the shape of the no-go set.
 
 stage               P(contact with obstacle j in (t_{i-1}, t_i]) <= delta for each stage i and j
+sample              P(contact with j at t_i) <= delta, constrained and measured at the samples
+                    alone: what the shape of the no-go set by itself is worth
+samples only        as `stage`, but constrained at the samples alone
 joint, uniform      P(any contact over the horizon) <= delta, in equal shares
 joint, iterative    the same, in shares that go where they are needed
 containment         the ellipsoid contains 1 - delta of the Gaussian (chi-square), so that each
@@ -23,7 +26,16 @@ from scp_mpc.safety.margin import Containment, JointRisk, Margin, Promise, Stage
 from scp_mpc.settings import require_positive
 
 DELTAS = (0.1, 0.05, 0.01)
-KINDS = ("stage", "samples only", "joint, uniform", "joint, iterative", "containment", "report")
+KINDS = (
+    "stage",
+    "sample",
+    "samples only",
+    "joint, uniform",
+    "joint, iterative",
+    "containment",
+    "report",
+)
+_AT_SAMPLES = ("sample", "samples only", "report")  # nothing is constrained in between
 INFLATIONS: tuple[Literal["exact", "axes"], ...] = ("exact", "axes")
 _REPORT = (Margin(), 0.05)
 
@@ -77,7 +89,7 @@ def driven_settings(deltas: Sequence[float] = DELTAS) -> list[RiskSetting]:
     return [
         setting
         for setting in all_settings(deltas)
-        if setting.kind != "samples only"
+        if setting.kind not in ("sample", "samples only")
         and (setting.inflation == "exact" or setting.kind in ("stage", "report"))
     ]
 
@@ -104,7 +116,7 @@ def problem_for(
         "inflation": setting.inflation,
         "max_obstacles": obstacles,
     }
-    if setting.kind in ("samples only", "report"):
+    if setting.kind in _AT_SAMPLES:
         values["subsamples"] = 1
     return Problem(model, **(values | given))
 

@@ -69,7 +69,7 @@ def _open_line(row: Row) -> list[object]:
 
 def _by_scene(opened: Sequence[Row]) -> str:
     """Scenes down, promises across: measured / delta, the report's and the stages' only."""
-    shown = [row for row in opened if row["kind"] in ("stage", "samples only", "report")]
+    shown = [row for row in opened if row["kind"] in ("stage", "sample", "samples only", "report")]
     names = [scene["scene"] for scene in opened[0]["scenes"]]
     titles = [f"{_promise(row)}, {row['inflation']}, {row['delta']:g}" for row in shown]
     head = "| Scene | " + " | ".join(titles) + " |\n|:--" + "|--:" * len(shown) + "|"

@@ -21,6 +21,7 @@ from scp_mpc.solver.qp import QPSolution, QPStatus
 
 _PRECISION = 1e-12
 _INFINITY = 1e30  # PIQP's own
+_KEPT = 2  # divisions of the rows that stay set up: firm and soft
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,8 @@ class RescueSolver:
         bounded = ~same & (np.isfinite(program.lower) | np.isfinite(program.upper))
         key = same.tobytes() + bounded.tobytes()
         if key not in self._known:
+            while len(self._known) >= _KEPT:
+                del self._known[next(iter(self._known))]
             parts = [_Rows.of(program.A, np.flatnonzero(mask)) for mask in (same, bounded)]
             solver = piqp.SparseSolver()
             for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
