@@ -1,5 +1,7 @@
 """A short drive past an obstacle, for tests that compare controllers."""
 
+import hashlib
+
 import numpy as np
 from instances import obstacle, straight_reference
 
@@ -22,6 +24,12 @@ def same(first, second):
         np.array_equal(a.X, b.X) and np.array_equal(a.U, b.U) and a.cost == b.cost
         for a, b in zip(first, second, strict=True)
     )
+
+
+def bits(plans):
+    """A fingerprint of everything that is applied."""
+    parts = (p.X.tobytes() + p.U.tobytes() + p.s.tobytes() for p in plans)
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def good():
