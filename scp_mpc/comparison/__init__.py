@@ -6,6 +6,7 @@ from scp_mpc.comparison.peer_plan import Peer, PeerMissingError, PeerPlan
 from scp_mpc.comparison.runner import BENCHMARKS, run
 from scp_mpc.comparison.sequence import RecordedStep, record
 from scp_mpc.comparison.slsqp import Slsqp
+from scp_mpc.comparison.soak import run_soak
 from scp_mpc.comparison.staged import Staged
 from scp_mpc.comparison.violation import largest_violation
 
@@ -22,4 +23,5 @@ __all__ = [
     "largest_violation",
     "record",
     "run",
+    "run_soak",
 ]

@@ -27,17 +27,18 @@ def in_one_thread(
     task: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
 ) -> Result:
     """Run a module's function in a process of its own and return, or raise, what it does."""
-    spawn = get_context("spawn")
-    with _environment(dict.fromkeys(_VARIABLES, "1")), ProcessPoolExecutor(1, spawn) as pool:
+    with one_thread_each(1) as pool:
         return pool.submit(task, *arguments, **named).result()
 
 
 @contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
+def one_thread_each(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of new processes, each of which keeps to one thread."""
+    before = {name: os.environ.get(name) for name in _VARIABLES}
+    os.environ.update(dict.fromkeys(_VARIABLES, "1"))
     try:
-        yield
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            yield pool
     finally:
         for name, value in before.items():
             if value is None:

@@ -9,7 +9,7 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def progress(total: int) -> Iterator[Callable[[], object]]:
+def progress(total: int, unit: str = "step") -> Iterator[Callable[[], object]]:
     """A progress bar on a terminal, if there is one and tqdm is installed."""
     bar: Any = None
     try:
@@ -17,7 +17,7 @@ def progress(total: int) -> Iterator[Callable[[], object]]:
     except ImportError:
         _log.debug("tqdm is not installed: no progress bar")
     else:
-        bar = tqdm(total=total, unit="step", disable=None)
+        bar = tqdm(total=total, unit=unit, disable=None)
     try:
         yield (lambda: None) if bar is None else bar.update
     finally:

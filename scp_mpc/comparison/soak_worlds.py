@@ -1,0 +1,210 @@
+"""Random worlds for the soak: who stands where, how well it is known, and what goes wrong."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.errors import NotFiniteError, ScpMpcError, ShapeError, TooManyObstaclesError
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.problem import Margin, Problem
+from scp_mpc.robots.double_integrator import DoubleIntegrator
+from scp_mpc.settings import Settings
+
+SLOTS = 6
+_DT = 0.2  # [s]
+_RISK = Margin(1.6448536269514722, 1.6448536269514722)  # 5 % per stage and obstacle
+_FREE = Margin(lower=0.5)
+_SHORT = 1e-6  # [s] no time at all
+_KNOWN = ("disc", "ellipse", "line", "point", "huge", "needle")
+_SHARES = (0.5, 0.32, 0.1, 0.05, 0.015, 0.015)
+_COUNTS = (0.2, 0.25, 0.2, 0.15, 0.1, 0.05, 0.05)  # of 0 .. SLOTS obstacles
+_ABSENT = 0.05  # chance that an obstacle is not seen in a step
+_ON_THE_ROBOT = 0.03  # chance per obstacle at the start
+_CARRIED_OFF = 0.005  # chance per step
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A problem and how it is solved.
+
+    Attributes:
+        name: In tables.
+        share: Of the episodes, relative to the others.
+        problem: What is solved.
+        settings: How.
+    """
+
+    name: str
+    share: float
+    problem: Problem
+    settings: Settings
+
+
+def kinds() -> list[Kind]:
+    """The problems of the soak; short horizons more often, which makes a million steps possible."""
+    rows: list[tuple[str, float, int, dict[str, Any], Settings]] = [
+        ("exact", 4, 8, {}, Settings()),
+        ("axes", 3, 8, {"inflation": "axes"}, Settings()),
+        ("free size", 2, 8, {"margin": _FREE}, Settings()),
+        ("axes, free size", 1, 8, {"inflation": "axes", "margin": _FREE}, Settings()),
+        ("risk", 3, 8, {"margin": _RISK}, Settings()),
+        ("biased limits", 2, 8, {"u_min": [-0.2, 0.3], "u_max": [2.0, 1.5]}, Settings()),
+        ("in space", 1, 8, {"model": DoubleIntegrator(_DT, 3)}, Settings(sides=False)),
+        ("no time", 3, 8, {}, Settings(deadline=_SHORT)),
+        ("sparse", 0.3, 8, {}, Settings(condense=False, sides=False)),
+        ("two iterations", 2, 15, {}, Settings(max_iterations=2)),
+        ("risk", 1, 15, {"margin": _RISK}, Settings()),
+        ("2 ms", 2, 30, {}, Settings(deadline=2e-3)),
+        ("exact", 0.5, 30, {}, Settings()),
+    ]
+    return [
+        Kind(f"{name}, N = {horizon}", share, _problem(horizon, **changes), settings)
+        for name, share, horizon, changes, settings in rows
+    ]
+
+
+def _problem(horizon: int, **changes: Any) -> Problem:
+    dim = changes.get("model", DoubleIntegrator(_DT)).dim
+    values: dict[str, Any] = {
+        "model": DoubleIntegrator(_DT),
+        "horizon": horizon,
+        "Q": [0.2, 0.05] * dim,
+        "R": [0.001] * dim,
+        "u_min": -3.0,
+        "u_max": 3.0,
+        "robot_radius": 0.15,
+        "max_obstacles": SLOTS,
+    }
+    return Problem(**(values | changes))
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """One obstacle: p(t) = position + t velocity, known with covariance (1 + growth i) Sigma."""
+
+    position: FloatArray
+    velocity: FloatArray
+    Sigma: FloatArray
+    growth: float
+    radius: float
+
+    def prediction(self, step: int, horizon: int) -> ObstaclePrediction:
+        """What the controller is told at a step."""
+        i = np.arange(horizon + 1)
+        means = self.position + _DT * np.outer(i + step, self.velocity)
+        return ObstaclePrediction(
+            means, (1 + self.growth * i)[:, None, None] * self.Sigma, self.radius
+        )
+
+
+class World:
+    """One episode: a robot that drives to and fro, obstacles on its way, wind and worse.
+
+    Args:
+        problem: Whose robot it is.
+        rng: Where all chance comes from.
+    """
+
+    def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
+        """Place everybody."""
+        self._problem, self._rng, self._step = problem, rng, 0
+        dim = problem.model.dim
+        self.x = np.zeros(problem.model.nx)
+        self.x[1::2] = rng.normal(0.0, 1.0, dim)
+        self._goal = rng.normal(0.0, 6.0, dim)
+        self._movers = [self._mover() for _ in range(rng.choice(SLOTS + 1, p=_COUNTS))]
+        self._wind = rng.choice([0.0, 0.0, 0.05, 0.3])
+
+    def seen(self) -> list[ObstaclePrediction]:
+        """What is predicted now; some obstacles are not seen."""
+        there = self._rng.random(len(self._movers)) >= _ABSENT
+        horizon = self._problem.horizon
+        return [
+            mover.prediction(self._step, horizon)
+            for mover, here in zip(self._movers, there, strict=True)
+            if here
+        ]
+
+    def reference(self) -> FloatArray:
+        """(nx,) where to go: the goal, at rest."""
+        held = np.zeros_like(self.x)
+        held[::2] = self._goal
+        return held
+
+    def advance(self, u: FloatArray) -> None:
+        """Apply an input; the wind blows, and now and then the robot is carried off."""
+        rng, x = self._rng, self.x
+        self.x = self._problem.model.step(x, u)
+        self.x[1::2] += self._wind * rng.standard_normal(len(u))
+        if rng.random() < _CARRIED_OFF:
+            self.x = self.x + rng.choice([1.0, 30.0, 1e5]) * rng.standard_normal(len(x))
+        if np.abs(self.x).max() > 1e6:
+            self.x = np.zeros_like(x)
+        self._step += 1
+
+    def _mover(self) -> Mover:
+        rng, dim = self._rng, self._problem.model.dim
+        share = rng.uniform(0.0, 1.0)
+        spot = share * self._goal + rng.normal(0.0, 1.5, dim)
+        if rng.random() < _ON_THE_ROBOT:
+            spot = self.x[::2].copy()
+        velocity = rng.normal(0.0, 1.0, dim) * rng.choice([0.0, 0.5, 1.5])
+        Sigma = _covariance(rng, dim)
+        return Mover(spot, velocity, Sigma, rng.choice([0.0, 0.05]), rng.choice([0.0, 0.2, 0.5]))
+
+
+def _covariance(rng: np.random.Generator, dim: int) -> FloatArray:
+    known = rng.choice(_KNOWN, p=_SHARES)
+    sigma = np.full(dim, 10 ** rng.uniform(-2.0, -0.3))
+    if known == "ellipse":
+        sigma = 10 ** rng.uniform(-2.0, 0.0, dim)
+    elif known in ("line", "needle"):
+        sigma[1:] = 0.0
+        sigma[0] *= 1.0 if known == "line" else 1e6
+    elif known == "point":
+        sigma[:] = 0.0
+    elif known == "huge":
+        sigma = 10 ** rng.uniform(1.0, 6.0, dim)
+    V = np.linalg.qr(rng.normal(size=(dim, dim)))[0]
+    Sigma: FloatArray = V @ np.diag(sigma**2) @ V.T
+    return (Sigma + Sigma.T) / 2
+
+
+Call = Callable[..., object]
+Fault = tuple[str, type[ScpMpcError], Callable[[Call, FloatArray, FloatArray, Problem], object]]
+
+
+def _nan(values: FloatArray) -> FloatArray:
+    spoilt = values.copy()
+    spoilt[0] = np.nan
+    return spoilt
+
+
+def _crowd(problem: Problem, rows: int, count: int) -> list[ObstaclePrediction]:
+    dim = problem.model.dim
+    return [ObstaclePrediction(np.zeros((rows, dim)), np.eye(dim), 0.1)] * count
+
+
+# Bad calls and the error that each must raise.
+FAULTS: list[Fault] = [
+    ("NaN in x0", NotFiniteError, lambda step, x, ref, _: step(_nan(x), ref)),
+    ("NaN in x_ref", NotFiniteError, lambda step, x, ref, _: step(x, _nan(ref))),
+    ("infinite x0", NotFiniteError, lambda step, x, ref, _: step(x + np.inf, ref)),
+    ("short x0", ShapeError, lambda step, x, ref, _: step(x[:-1], ref)),
+    ("long prediction", ShapeError, lambda step, x, ref, p: step(x, ref, _crowd(p, 99, 1))),
+    (
+        "too many obstacles",
+        TooManyObstaclesError,
+        lambda step, x, ref, p: step(x, ref, _crowd(p, p.horizon + 1, SLOTS + 1)),
+    ),
+    (
+        "NaN in a prediction",
+        NotFiniteError,
+        lambda step, x, ref, p: step(
+            x, ref, [ObstaclePrediction(_nan(np.zeros((p.horizon + 1, 2))), np.eye(2), 0.1)]
+        ),
+    ),
+]
