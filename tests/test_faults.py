@@ -194,6 +194,21 @@ def test_05_no_input_comes_from_a_program_without_a_solution(condense, first, mo
     assert mpc.step(**good()).ok
 
 
+@pytest.mark.parametrize("iterations", range(1, 7))
+@pytest.mark.parametrize("sides", [True, False])
+def test_05_obstacles_far_from_the_first_plan_are_not_forgotten(iterations, sides):
+    """The way round the large one leads into the small one, which was out of reach before."""
+    N = 15
+    case = problem(N, max_obstacles=2)
+    present = [
+        ObstaclePrediction(np.tile(at, (N + 1, 1)), 1e-4 * np.eye(2), radius)
+        for at, radius in (([5.0, 0.1], 2.5), ([5.0, -3.6], 0.5))
+    ]
+    settings = Settings(max_iterations=iterations, sides=sides)
+    x0, goal = np.array([0.0, 2.0, 0.0, 0.0]), np.array([8.0, 0.0, 0.0, 0.0])
+    solve_and_hold(case, x0, goal, present, settings)
+
+
 @pytest.mark.parametrize("garbage", [NAN, INF, 2143289344.0, 1e300])
 def test_05_a_solver_that_returns_garbage_is_not_believed(garbage, monkeypatch):
     case = problem(N)
