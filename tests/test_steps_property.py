@@ -38,7 +38,7 @@ def hold(problem, step, settings):
     assert judge(problem, *step.given, plan).complaints == []
 
 
-@profile(600)
+@profile(400)
 @given(st.data())
 def test_in_the_plane(data):
     problem = data.draw(problems())
@@ -46,14 +46,14 @@ def test_in_the_plane(data):
 
 
 @pytest.mark.parametrize("settings", KINDS[1:], ids=["one", "sparse", "sparse one", "no time", "-"])
-@profile(120)
+@profile(90)
 @given(st.data())
 def test_in_the_plane_with_other_settings(settings, data):
     problem = data.draw(problems(horizons=(3, 8)))
     hold(problem, data.draw(steps(problem)), settings)
 
 
-@profile(150)
+@profile(100)
 @given(st.data())
 def test_in_space(data):
     problem = data.draw(problems(dim=3, horizons=(1, 5)))
