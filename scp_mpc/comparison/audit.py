@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
+from scp_mpc.safety.margin import JointRisk, StageRisk
 from scp_mpc.solver.plan import Plan
 
 _TOLERANCE = 1e-6  # [m], that of the settings
@@ -62,7 +64,8 @@ def audit(
     defect = float(np.abs(states - plan.X).max())
     if not defect <= _TOLERANCE * max(1.0, float(np.abs(states).max())):
         return Finding(lie=f"{plan.status.name}: the states do not follow by {defect:.3g}")
-    depth = _depth(problem, states[1:, problem.model.position], obstacles, plan.s)
+    positions = states[1:, problem.model.position]
+    depth = _depth(problem, positions, obstacles, _sizes(problem, plan.s))
     if depth > 0:
         return Finding(lie=f"{plan.status.name}: a constraint is violated by {depth:.3g} m")
     return Finding()
@@ -104,12 +107,16 @@ def _depth(
         return 0.0
     given = y[near], Sigma[near], sizes[near], reaches[near]
     axes = problem.inflation == "axes"
-    outside = _axes(*given, _reference(problem)) if axes else _exact(*given)
+    outside = _axes(*given, problem.size.reference) if axes else _exact(*given)
     return max(0.0, float((-outside - allowed[near]).max()))
 
 
-def _reference(problem: Problem) -> float:
-    return float(getattr(problem, "size", problem.margin).reference)
+def _sizes(problem: Problem, s: FloatArray) -> FloatArray:
+    """What each sample must keep at least: a share of a risk is never more than all of it."""
+    margin = problem.margin
+    if isinstance(margin, StageRisk | JointRisk):
+        return np.full(len(s), float(norm.isf(margin.delta)))
+    return s
 
 
 def _axes(

@@ -1,5 +1,6 @@
 """One chunk of the soak: many control steps in one process, counted."""
 
+import logging
 import os
 import resource
 import sys
@@ -70,6 +71,7 @@ class Tally:
 
 def run_chunk(seed: int, index: int, steps: int) -> dict[str, Any]:
     """Run `steps` control steps from the child `index` of a seed; return the line to write."""
+    logging.getLogger("scp_mpc").setLevel(logging.ERROR)  # it is warned about by design
     began = perf_counter()
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     tally, fleet = Tally(), _fleet()
@@ -102,7 +104,7 @@ def _fleet() -> list[tuple[Kind, MPC, MPC]]:
 def _step(
     kind: Kind, mpc: MPC, twin: MPC | None, world: World, rng: np.random.Generator, tally: Tally
 ) -> None:
-    x, x_ref, seen = world.x, world.reference(), world.seen()
+    x, x_ref, seen, time = world.x, world.reference(), world.seen(), world.time
     if rng.random() < _RESET:
         for one in (mpc, twin):
             if one is not None:
@@ -113,7 +115,7 @@ def _step(
     tally.kinds[kind.name] += 1
     began = perf_counter()
     try:
-        plan = mpc.step(x, x_ref, seen)
+        plan = mpc.step(x, x_ref, seen, time=time)
     except Exception as error:  # whatever it is, it must not happen
         tally.escaped += 1
         tally.note(f"{kind.name}: {type(error).__name__}: {error}")
@@ -126,14 +128,14 @@ def _step(
     if kind.settings.deadline is not None and kind.settings.deadline > 1e-5:
         tally.timed += 1
         tally.late += seconds > 1.5 * kind.settings.deadline
-    finding = audit(kind.problem, x, seen, plan)
+    finding = audit(kind.problem, x, mpc.obstacles, plan)
     tally.invalid += bool(finding.invalid)
     tally.lies += bool(finding.lie)
     if finding.invalid or finding.lie:
         tally.note(f"{kind.name}: {finding.invalid or finding.lie}")
     if twin is not None:
         tally.compared += 1
-        if not _same(plan, twin.step(x, x_ref, seen)):
+        if not _same(plan, twin.step(x, x_ref, seen, time=time)):
             tally.traces += 1
             tally.note(f"{kind.name}: differs from a controller that saw no bad call")
     u = plan.u0 if not finding.invalid else np.clip(0.0, kind.problem.u_min, kind.problem.u_max)

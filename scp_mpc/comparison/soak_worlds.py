@@ -1,7 +1,7 @@
 """Random worlds for the soak: who stands where, how well it is known, and what goes wrong."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,19 +9,21 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import NotFiniteError, ScpMpcError, ShapeError, TooManyObstaclesError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.problem import Margin, Problem
+from scp_mpc.problem import Problem
 from scp_mpc.robots.double_integrator import DoubleIntegrator
+from scp_mpc.safety.margin import JointRisk, Margin, StageRisk
 from scp_mpc.settings import Settings
 
 SLOTS = 6
 _DT = 0.2  # [s]
-_RISK = Margin(1.6448536269514722, 1.6448536269514722)  # 5 % per stage and obstacle
 _FREE = Margin(lower=0.5)
 _SHORT = 1e-6  # [s] no time at all
 _KNOWN = ("disc", "ellipse", "line", "point", "huge", "needle")
 _SHARES = (0.5, 0.32, 0.1, 0.05, 0.015, 0.015)
 _COUNTS = (0.2, 0.25, 0.2, 0.15, 0.1, 0.05, 0.05)  # of 0 .. SLOTS obstacles
 _ABSENT = 0.05  # chance that an obstacle is not seen in a step
+_STAMPED = 0.5  # share of the episodes in which predictions have stamps and names
+_LATE = (0.8, 0.19, 0.01)  # chances that they are on time, late, too late
 _ON_THE_ROBOT = 0.03  # chance per obstacle at the start
 _CARRIED_OFF = 0.005  # chance per step
 
@@ -50,13 +52,16 @@ def kinds() -> list[Kind]:
         ("axes", 3, 8, {"inflation": "axes"}, Settings()),
         ("free size", 2, 8, {"margin": _FREE}, Settings()),
         ("axes, free size", 1, 8, {"inflation": "axes", "margin": _FREE}, Settings()),
-        ("risk", 3, 8, {"margin": _RISK}, Settings()),
+        ("samples alone", 2, 8, {"subsamples": 1}, Settings()),
+        ("stage risk", 2, 8, {"margin": StageRisk(0.05)}, Settings()),
+        ("joint risk", 1, 8, {"margin": JointRisk(0.05)}, Settings()),
+        ("joint risk, iterative", 0.5, 8, {"margin": JointRisk(0.05, "iterative")}, Settings()),
         ("biased limits", 2, 8, {"u_min": [-0.2, 0.3], "u_max": [2.0, 1.5]}, Settings()),
         ("in space", 1, 8, {"model": DoubleIntegrator(_DT, 3)}, Settings(sides=False)),
         ("no time", 3, 8, {}, Settings(deadline=_SHORT)),
         ("sparse", 0.3, 8, {}, Settings(condense=False, sides=False)),
         ("two iterations", 2, 15, {}, Settings(max_iterations=2)),
-        ("risk", 1, 15, {"margin": _RISK}, Settings()),
+        ("stage risk", 0.5, 15, {"margin": StageRisk(0.05)}, Settings()),
         ("2 ms", 2, 30, {}, Settings(deadline=2e-3)),
         ("exact", 0.5, 30, {}, Settings()),
     ]
@@ -117,16 +122,26 @@ class World:
         self._goal = rng.normal(0.0, 6.0, dim)
         self._movers = [self._mover() for _ in range(rng.choice(SLOTS + 1, p=_COUNTS))]
         self._wind = rng.choice([0.0, 0.0, 0.05, 0.3])
+        self._stamped = bool(rng.random() < _STAMPED)
+
+    @property
+    def time(self) -> float | None:
+        """Now [s], on the clock of the stamps; None where nobody has a clock."""
+        return _DT * self._step if self._stamped else None
 
     def seen(self) -> list[ObstaclePrediction]:
-        """What is predicted now; some obstacles are not seen."""
-        there = self._rng.random(len(self._movers)) >= _ABSENT
-        horizon = self._problem.horizon
-        return [
-            mover.prediction(self._step, horizon)
-            for mover, here in zip(self._movers, there, strict=True)
+        """What is predicted now; some obstacles are not seen, some predictions are late."""
+        rng, horizon = self._rng, self._problem.horizon
+        there = rng.random(len(self._movers)) >= _ABSENT
+        seen = [
+            (j, mover.prediction(self._step, horizon))
+            for j, (mover, here) in enumerate(zip(self._movers, there, strict=True))
             if here
         ]
+        if self.time is None:
+            return [prediction for _, prediction in seen]
+        late = rng.choice([0.0, rng.uniform(0.0, 0.5), 2.0], p=_LATE)
+        return [replace(o, stamp=self.time - late, name=f"mover {j}") for j, o in seen]
 
     def reference(self) -> FloatArray:
         """(nx,) where to go: the goal, at rest."""

@@ -70,8 +70,8 @@ class Ladder:
                 # As far as the bounds allow in the direction of what is wanted; inputs without
                 # any room stay where they are.
                 room = np.where(wanted > 0, most, least)
-                wanted = np.where(room == 0, 0.0, wanted)
-                room = np.where(room == 0, 1.0, room)
+                none = np.abs(room) <= _AT_REST
+                wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
                 u += wanted / np.maximum(wanted / room, 1.0).max()
             states[i + 1] = model.step(states[i], u)
         return self._judged(step, states, np.clip(U, problem.u_min, problem.u_max), status)
@@ -81,7 +81,8 @@ class Ladder:
     ) -> Descent:
         """A trajectory with its true violation; FALLBACK where there is any."""
         problem = self._problem
-        s = np.full(problem.max_obstacles, problem.size.lower)
+        s = np.full(problem.max_obstacles, problem.size.reference)
+        s[: step.count] = problem.size.lower  # all that a plan without a search can promise
         slack = np.zeros((problem.max_obstacles, step.sampling.points))
         slack[: step.count] = step.depths(step.sampling.positions(states, inputs), s)
         most = float(slack.max(initial=0.0))

@@ -78,9 +78,9 @@ class Resolution:
         """Programs solved in this control step, which ended with this engine."""
         return self.coarse.finished + (Counter() if engine is self.coarse else engine.finished)
 
-    def assumed(self, engine: Engine, start: Iterate) -> Sweep | None:
+    def assumed(self, engine: Engine, step: StepData, start: Iterate) -> Sweep | None:
         """What the plan is assumed to do between two points; None where that does not matter."""
-        if not self._covers_gaps:
+        if not self._covers_gaps or not step.count:
             return None
         return engine.assumed(start)
 

@@ -166,7 +166,7 @@ class SCP:
         start = engine.free() if last is None else last
         for _ in range(_CORRECTIONS):
             start = start.resampled(engine.sampling.count)
-            sweep = self._resolution.assumed(engine, start)
+            sweep = self._resolution.assumed(engine, step, start)
             wide = self._resolution.widened(engine, step, sweep)
             found = Found(engine.descend(start) or self._ladder.resort(wide, last))
             if self._challenge.wanted(found.best, challenge):
