@@ -168,7 +168,7 @@ def test_any_sequence_of_calls():
     run_state_machine_as_test(
         Control,
         settings=hypothesis_settings(
-            max_examples=200,
+            max_examples=100,
             stateful_step_count=25,
             deadline=None,
             derandomize=True,

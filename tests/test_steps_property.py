@@ -38,7 +38,7 @@ def hold(problem, step, settings):
     assert judge(problem, *step.given, plan).complaints == []
 
 
-@profile(400)
+@profile(200)
 @given(st.data())
 def test_in_the_plane(data):
     problem = data.draw(problems())

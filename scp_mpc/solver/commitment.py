@@ -11,6 +11,7 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.safety.risk import risk_bound
+from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.step_data import StepData
 
 
@@ -43,8 +44,9 @@ def point_risks(step: StepData, path: FloatArray) -> FloatArray:
     return risk_bound(sets, path)
 
 
-def plan_risk(step: StepData, path: FloatArray) -> PlanRisk:
-    """Add the bounds up."""
+def plan_risk(step: StepData, iterate: Iterate) -> PlanRisk:
+    """Add the bounds up along a plan."""
+    path = step.sampling.positions(iterate.states, iterate.inputs)
     points = step.sampling.stages(point_risks(step, path))
     whole = points.sum(axis=(1, 2))
     stages = points.sum(axis=2)

@@ -76,7 +76,8 @@ class Resolution:
 
     def finished(self, engine: Engine) -> Counter[str]:
         """Programs solved in this control step, which ended with this engine."""
-        return self.coarse.finished + (Counter() if engine is self.coarse else engine.finished)
+        finished = self.coarse.finished
+        return finished if engine is self.coarse else finished + engine.finished
 
     def assumed(self, engine: Engine, step: StepData, start: Iterate) -> Sweep | None:
         """What the plan is assumed to do between two points; None where that does not matter."""

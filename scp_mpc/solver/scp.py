@@ -197,13 +197,14 @@ class SCP:
     def _plan(self, step: StepData, found: Found, watch: Stopwatch, qps: Mapping[str, int]) -> Plan:
         best, inside = found.best, watch.inside.seconds
         iterate = best.iterate
-        path = step.sampling.positions(iterate.states, iterate.inputs)
-        slack = step.sampling.stages(iterate.slack[: step.count]).max(axis=2, initial=0.0)
+        slack = iterate.slack[: step.count]
+        if step.sampling.count > 1:
+            slack = frozen(step.sampling.stages(slack).max(axis=2, initial=0.0))
         return Plan(
             X=iterate.states,
             U=iterate.inputs,
             s=iterate.s[: step.count],
-            slack=frozen(slack),
+            slack=slack,
             cost=best.cost,
             status=best.status,
             kkt=best.residuals,
@@ -218,5 +219,5 @@ class SCP:
                 total=watch.elapsed,
             ),
             iterate=iterate,
-            commitment=partial(plan_risk, step, path),
+            commitment=partial(plan_risk, step, iterate),
         )
