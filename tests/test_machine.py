@@ -5,6 +5,7 @@ and the plan is bit for bit that of a twin that never saw a bad call.
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from scp_mpc import (
     ObstaclePrediction,
     Settings,
     ShapeError,
+    Status,
     TooManyObstaclesError,
 )
 from scp_mpc.solver.active_set import ActiveSetSolver
@@ -66,8 +68,25 @@ class Control(RuleBasedStateMachine):
             )
 
     @rule()
+    def names(self):
+        """From now on those that vanish are known by name, and kept."""
+        known = [replace(o, name=f"{j}") for j, o in enumerate(self.step.obstacles)]
+        self.step.obstacles[:] = known
+
+    @rule()
     def one_vanishes(self):
         del self.step.obstacles[:1]
+
+    @precondition(lambda self: self.step.obstacles)
+    @rule()
+    def too_old(self):
+        """All predictions are from before the first step: the robot brakes, whatever else."""
+        old = [replace(o, stamp=-9.0) for o in self.step.obstacles]
+        given = self.step.x0, self.step.x_ref, old
+        mine, other = self.mpc.step(*given), self.twin.step(*given)
+        assert mine.status is Status.STALE
+        assert not mine.ok
+        assert equal(mine, other)
 
     @rule(repeats=st.integers(1, 3))
     def good(self, repeats):
@@ -151,7 +170,10 @@ class Control(RuleBasedStateMachine):
         assert np.isfinite(plan.u0).all()
         assert (plan.u0 >= self.problem.u_min).all()
         assert (plan.u0 <= self.problem.u_max).all()
-        assert judge(self.problem, *self.step.given, plan).complaints == []
+        known = list(self.mpc.obstacles)  # those given, and those kept
+        if not self.step.obstacles or self.step.obstacles[0].name is None:
+            assert len(known) >= len(self.step.obstacles)
+        assert judge(self.problem, self.step.x0, self.step.x_ref, known, plan).complaints == []
         assert equal(plan, other)
         self.plan = plan
 
