@@ -43,8 +43,13 @@ class Challenge:
         self._problem, self._settings = problem, settings
 
     def wanted(self, best: Descent, due: bool) -> bool:
-        """Whether to try: the plan is not safe, or it is time to and an obstacle shapes it."""
-        return self._settings.sides and (not best.status.ok or (due and best.iterate.touches))
+        """Whether to try: the plan is not safe, or it is time to and an obstacle shapes it.
+
+        Not where no program was solved: there is no time, or no solver.
+        """
+        if not self._settings.sides or best.iterate.multipliers is None:
+            return False
+        return not best.status.ok or (due and best.iterate.touches)
 
     def run(self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent) -> Found:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
@@ -61,7 +66,7 @@ class Challenge:
         watch.learn("way", began, len(sides))
         tried = tuple(
             Candidate(side.obstacle, side.normal, side.time, start.merit)
-            for side, start in zip(sides, starts, strict=False)  # none if they are too many
+            for side, start in zip(sides, starts, strict=False)  # fewer where time ran out
         )
         goal, switched = best, False
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order

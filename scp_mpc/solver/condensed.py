@@ -88,6 +88,17 @@ class Condensed:
         p = self.sampling.deviations(e, u)
         return np.concatenate([p.ravel(), u.ravel(), self._sizes])
 
+    def started_like(self, other: "Condensed", y: FloatArray) -> FloatArray:
+        """`start` for other points, from the y that another one found for the same step."""
+        self._drift = other._drift
+        return self.of_inputs(y[other.u], y[other.s])
+
+    def of_inputs(self, u: FloatArray, s: FloatArray) -> FloatArray:
+        """Return y of inputs u (N nu,) and sizes s (M,) in this step."""
+        inputs = u.reshape(-1, self._problem.model.nu)
+        p = self.sampling.deviations(self.deviations(inputs), inputs)
+        return np.concatenate([p.ravel(), u, s])
+
     def deviations(self, inputs: FloatArray) -> FloatArray:
         """Roll inputs (N, nu) out from this step's x0: e (N, nx)."""
         pushed = inputs @ self._problem.model.B.T + self._drift

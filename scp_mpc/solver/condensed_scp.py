@@ -43,6 +43,7 @@ class CondensedSCP:
         self._problem, self._settings, self._condensed = problem, settings, condensed
         self._qp = ActiveSetSolver(condensed.response[condensed.boxed])
         self._position = problem.model.position
+        self._at: CondensedStep
 
     @classmethod
     def of(cls, problem: Problem, settings: Settings, sampling: Sampling) -> "CondensedSCP | None":
@@ -57,10 +58,17 @@ class CondensedSCP:
         """Programs solved since `begin`, by solver."""
         return self._at.finished
 
-    def begin(self, step: StepData, watch: Stopwatch) -> None:
-        """Read a control step and find the plan that nothing constrains."""
+    def begin(self, step: StepData, watch: Stopwatch, like: "CondensedSCP | None" = None) -> None:
+        """Read a control step and find the plan that nothing constrains.
+
+        Args:
+            step: The control step.
+            watch: Its clock.
+            like: Who has begun the same step at other points.
+        """
         self._qp.limit(watch.deadline)
-        self._at = CondensedStep(self._problem, self._condensed, self._qp, step, watch)
+        known = None if like is None else like._at
+        self._at = CondensedStep(self._problem, self._condensed, self._qp, step, watch, known)
 
     def widen(self, step: StepData) -> None:
         """Take other radii or sizes for the step that has begun."""
@@ -112,11 +120,14 @@ class CondensedSCP:
             end = newton.descend(y, active, limit - iterations, began)
             if end is None:
                 return last
+            landing = at.watch.elapsed
             iterations, y = iterations + end.iterations, end.point.y
             missed = data.within(at.path(y), y[c.s], 0.0, known=near)
+            depths = None if missed is None else data.depths(at.path(y)[1:], y[c.s])
+            last = self._ended(end.point, end.cap, iterations, depths)
+            at.watch.learn("landing", landing)
             if missed is None:
-                return self._ended(end.point, end.cap, iterations)
-            last = self._ended(end.point, end.cap, iterations, data.depths(at.path(y)[1:], y[c.s]))
+                return last
             if iterations >= limit or not at.watch.affords("first program"):
                 return last
             began = at.watch.elapsed
@@ -126,7 +137,7 @@ class CondensedSCP:
     def glimpses(
         self, best: Iterate, paths: Sequence[FloatArray], firm: bool = True
     ) -> list[Glimpse]:
-        """Solve one program about each path (C, d), all linearised at once.
+        """Solve one program about each path (C, d), all linearised at once, until the deadline.
 
         Args:
             best: Whose bounds and sizes to begin with.
@@ -151,10 +162,12 @@ class CondensedSCP:
             A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
             b -= (a * at.y_free[conflicts.at]).sum(axis=2)
         bounds, cap = self._active_bounds(best), np.inf if firm else self._problem.slack_weight
-        return [
-            self._glimpse(at.program(rows, least), bounds, cap, conflicts, best, path)
-            for rows, least, path in zip(A, b, paths, strict=True)
-        ]
+        found = []
+        for rows, least, path in zip(A, b, paths, strict=True):
+            if at.watch.remaining < 0:
+                break
+            found.append(self._glimpse(at.program(rows, least), bounds, cap, conflicts, best, path))
+        return found
 
     def _glimpse(
         self,

@@ -27,6 +27,7 @@ class CondensedStep:
         qp: Solves its programs.
         step: The control step.
         watch: Where its time goes.
+        like: The same step at other points, whose plan that ignores the obstacles is known.
 
     Attributes:
         y_free: (ny,) the plan that nothing constrains.
@@ -40,13 +41,20 @@ class CondensedStep:
         qp: ActiveSetSolver,
         step: StepData,
         watch: Stopwatch,
+        like: "CondensedStep | None" = None,
     ) -> None:
         """Find the plan that nothing constrains, and the room it leaves to the bounds."""
         self.problem, self.condensed, self.data, self.watch = problem, condensed, step, watch
         self.finished: Counter[str] = Counter()
         self._qp, self._certificate = qp, Certificate(problem, condensed)
         with watch.solving:
-            self.y_free = condensed.start(step.x0, step.x_ref)
+            if like is None:
+                self.y_free = condensed.start(step.x0, step.x_ref)
+            else:
+                self.y_free = condensed.started_like(like.condensed, like.y_free)
+                y, reaction = like.within_bounds
+                known = condensed.of_inputs(y[like.condensed.u], y[like.condensed.s])
+                self.within_bounds = known, reaction
             box = self.y_free[condensed.boxed]
             self._room = (
                 condensed.lower[condensed.boxed] - box,

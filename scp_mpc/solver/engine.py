@@ -64,10 +64,13 @@ class Engine:
             return self.primary.finished
         return self.primary.finished + self.sparse.finished
 
-    def begin(self, step: StepData, watch: Stopwatch) -> None:
-        """Read a control step."""
+    def begin(self, step: StepData, watch: Stopwatch, like: "Engine | None" = None) -> None:
+        """Read a control step; `like` is who has begun the same one at other points."""
         self._step, self._watch, self._fresh = step, watch, True
-        self.primary.begin(step, watch)
+        if self._condensed is not None:
+            self._condensed.begin(step, watch, None if like is None else like._condensed)
+        else:
+            self.sparse.begin(step, watch)
 
     def widen(self, step: StepData) -> None:
         """Take other radii or sizes for the step that has begun."""

@@ -29,8 +29,17 @@ class Ladder:
     """
 
     def __init__(self, problem: Problem, tolerance: float) -> None:
-        """Remember both."""
+        """Find the response of all states to the state now and to all inputs."""
         self._problem, self._tolerance = problem, tolerance
+        model, N = problem.model, problem.horizon
+        powers = [np.eye(model.nx)]
+        response = np.zeros((N, model.nx, N, model.nu))
+        with np.errstate(over="ignore", invalid="ignore"):  # then nothing rolled out is judged safe
+            for k in range(N):
+                response[np.arange(k, N), :, np.arange(N - k)] = powers[-1] @ model.B
+                powers.append(model.A @ powers[-1])
+        self._drift = np.concatenate(powers[1:])
+        self._response = response.reshape(N * model.nx, N * model.nu)
 
     def resort(self, step: StepData, last: Iterate | None) -> Descent:
         """The last plan, if it meets every constraint; else braking, whether it does or not."""
@@ -46,41 +55,36 @@ class Ladder:
 
     def keep(self, step: StepData, inputs: FloatArray) -> Descent:
         """Roll the last plan's inputs (N, nu) out from the state now."""
-        problem, model = self._problem, self._problem.model
-        U = np.clip(inputs, problem.u_min, problem.u_max)
-        states = np.empty((problem.horizon + 1, model.nx))
-        states[0] = step.x0
-        for i, u in enumerate(U):
-            states[i + 1] = model.step(states[i], u)
-        return self._judged(step, states, U, Status.PREVIOUS)
+        problem = self._problem
+        return self._judged(step, np.clip(inputs, problem.u_min, problem.u_max), Status.PREVIOUS)
 
     def brake(self, step: StepData, status: Status = Status.BRAKING) -> Descent:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
-        problem, model = self._problem, self._problem.model
+        problem, model, x = self._problem, self._problem.model, step.x0
         rest = np.clip(np.zeros(model.nu), problem.u_min, problem.u_max)
         most, least = problem.u_max - rest, problem.u_min - rest
         U = np.tile(rest, (problem.horizon, 1))
-        states = np.empty((problem.horizon + 1, model.nx))
-        states[0] = step.x0
-        moving = True
-        for i, u in enumerate(U):
-            wanted = model.brake(states[i]) - rest if moving else rest
-            moving = moving and float(np.abs(wanted).max()) > _AT_REST
-            if moving:
-                # As far as the bounds allow in the direction of what is wanted; inputs without
-                # any room stay where they are.
-                room = np.where(wanted > 0, most, least)
-                none = np.abs(room) <= _AT_REST
-                wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
-                u += wanted / np.maximum(wanted / room, 1.0).max()
-            states[i + 1] = model.step(states[i], u)
-        return self._judged(step, states, np.clip(U, problem.u_min, problem.u_max), status)
+        for u in U:
+            wanted = model.brake(x) - rest
+            if float(np.abs(wanted).max()) <= _AT_REST:
+                break
+            # As far as the bounds allow in the direction of what is wanted; inputs without any
+            # room stay where they are.
+            room = np.where(wanted > 0, most, least)
+            none = np.abs(room) <= _AT_REST
+            wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
+            u += wanted / max(1.0, float((wanted / room).max()))
+            x = model.step(x, u)
+        return self._judged(step, np.clip(U, problem.u_min, problem.u_max), status)
 
-    def _judged(
-        self, step: StepData, states: FloatArray, inputs: FloatArray, status: Status
-    ) -> Descent:
-        """A trajectory with its true violation; FALLBACK where there is any."""
+    def _judged(self, step: StepData, inputs: FloatArray, status: Status) -> Descent:
+        """The trajectory of inputs with its true violation; FALLBACK where there is any."""
         problem = self._problem
+        states = np.empty((problem.horizon + 1, problem.model.nx))
+        states[0] = step.x0
+        states[1:] = (self._drift @ step.x0 + self._response @ inputs.ravel()).reshape(
+            -1, problem.model.nx
+        )
         s = np.full(problem.max_obstacles, problem.size.reference)
         s[: step.count] = problem.size.lower  # all that a plan without a search can promise
         slack = np.zeros((problem.max_obstacles, step.sampling.points))

@@ -69,7 +69,7 @@ class Resolution:
         if not too_fast(step, sweep):
             return coarse, step, None
         step = step.sampled(fine.sampling)
-        fine.begin(step, watch)
+        fine.begin(step, watch, like=coarse)
         wide = self.widened(fine, step, fine.free_sweep())
         best = fine.unhindered()
         return fine, step if best is None else wide, best
@@ -106,7 +106,7 @@ class Resolution:
         if engine is self.fine:
             return engine, step
         step = step.sampled(self.fine.sampling)
-        self.fine.begin(step, watch)
+        self.fine.begin(step, watch, like=self.coarse)
         return self.fine, step
 
 

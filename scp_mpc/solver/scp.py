@@ -137,15 +137,19 @@ class SCP:
         self._resolution.forget()
 
     def _warm_up(self) -> None:
-        """Solve a step with an obstacle in the way: first calls are slow, and paces unknown."""
+        """Solve some steps with everybody in the way: first calls are slow, and paces unknown."""
         problem, model = self.problem, self.problem.model
-        way = np.zeros((problem.horizon + 1, model.nx))
-        way[:, model.position[0]] = np.linspace(0.0, 4.0, len(way))
-        means = np.full((len(way), model.dim), 0.1)
-        means[:, 0] += 2.0
-        block = ObstaclePrediction(means, 0.01 * np.eye(model.dim), 0.1)
-        for _ in range(_WARM_UP):
-            self.solve(way[0], way, [block] * min(problem.max_obstacles, 1))
+        M, rows = problem.max_obstacles, problem.horizon + 1
+        fast, slow = np.zeros((2, rows, model.nx))
+        fast[:, model.position[0]] = np.linspace(0.0, 4.0 * problem.robot_radius * rows, rows)
+        slow[:, model.position[0]] = np.linspace(0.0, 4.0, rows)
+        for way in (fast, slow) * _WARM_UP:
+            means = np.zeros((M, rows, model.dim))
+            means[..., 0] = np.linspace(0.3, 0.9, M)[:, None] * way[-1, model.position[0]]
+            means[..., 1] = 0.1 * (-1.0) ** np.arange(M)[:, None]
+            self.solve(
+                way[0], way, [ObstaclePrediction(m, 0.01 * np.eye(model.dim), 0.1) for m in means]
+            )
 
     def _solve(
         self,

@@ -22,6 +22,8 @@ from scp_mpc.safety.margin import Margin
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.solver.sampling import Sampling
 
+_SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
+
 
 @dataclass(frozen=True, eq=False)
 class StepData:
@@ -129,6 +131,15 @@ class StepData:
         return spreads
 
     @cached_property
+    def drift(self) -> FloatArray:
+        """Way of the obstacles between two points (J, C) [m]; see `sweep.py`."""
+        way, count = self.means[:, 1:] - self.means[:, :-1], self.sampling.count
+        variances = np.array([o.spread for o in self.obstacles]) ** 2
+        growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0)) / count
+        length: FloatArray = np.sqrt(_squared(way))
+        return length + _SIGMAS * np.repeat(growth, count, axis=1)
+
+    @cached_property
     def sets(self) -> NoGoSets:
         """The obstacles' ellipsoids at all points, in all M slots."""
         means, M = self.means[:, 1:], self.problem.max_obstacles
@@ -221,7 +232,7 @@ class StepData:
         if not self.obstacles:
             return None
         y = positions[1:] - self.means[:, 1:]
-        length2 = np.add.reduce(y * y, axis=2)
+        length2 = _squared(y)
         reach = self.radii + distance
         size = s[: self.count, None]
         least = size * self.spreads[:, 1:] + reach
@@ -260,3 +271,11 @@ class StepData:
         """Which no-go sets a path (C, d) enters at sizes s (M,): (J, C)."""
         inside: BoolArray = self.depths(path, s) > 0
         return inside
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    """Squared lengths (...) of many short vectors (..., d): component by component."""
+    total: FloatArray = vectors[..., 0] * vectors[..., 0]
+    for k in range(1, vectors.shape[-1]):
+        total += vectors[..., k] * vectors[..., k]
+    return total

@@ -6,7 +6,7 @@ from types import TracebackType
 
 _FORGET = 0.02  # of the difference to a shorter time, each time it is measured
 _LEAST = 1e-6  # [s] of any task
-_EASE = 0.9  # of a time, each time that it stood in the way: or one hiccup would do so for ever
+_EASE = 0.98  # of a time, each time that it stood in the way: or one hiccup would do so for ever
 
 
 class Lap:
@@ -96,7 +96,7 @@ class Stopwatch:
         """Whether a task, and what ends the step, are predicted to end before the deadline."""
         if self._deadline == inf:
             return True
-        if self._pace.expected(task) + self._pace.expected("ending") <= self.remaining:
+        if self._pace.expected(task) + self._after <= self.remaining:
             return True
         self._pace.ease(task)
         return False
@@ -105,11 +105,16 @@ class Stopwatch:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
         if self._deadline == inf:
             return most
-        spare = self.remaining - self._pace.expected(then) - self._pace.expected("ending")
+        spare = self.remaining - self._pace.expected(then) - self._after
         times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
         if times < most:
             self._pace.ease(task)
         return times
+
+    @property
+    def _after(self) -> float:
+        """What comes after the last program: judging where it ended, and ending the step."""
+        return self._pace.expected("landing") + self._pace.expected("ending")
 
     def learn(self, task: str, since: float, times: int = 1) -> None:
         """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""

@@ -20,7 +20,6 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.solver.step_data import StepData
 
-_SIGMAS = 3.0
 _RESERVE = 1.2  # of what is assumed about a plan over what is known of the one before
 
 
@@ -59,20 +58,10 @@ class Sweep:
 
 def too_fast(step: StepData, sweep: Sweep) -> bool:
     """Whether the relative way from sample to sample exceeds the radii."""
-    return bool((sweep.chord + _drift(step) > step.radii).any())
+    return bool((sweep.chord + step.drift > step.radii).any())
 
 
 def swept(step: StepData, sweep: Sweep) -> StepData:
     """The step with radii that leave room for what happens between its points."""
-    way = (sweep.chord + _drift(step)) / 2
+    way = (sweep.chord + step.drift) / 2
     return step.widened(np.hypot(step.radii + sweep.sag, way))
-
-
-def _drift(step: StepData) -> FloatArray:
-    """Way of the obstacles between two points (J, C) [m]."""
-    way = step.means[:, 1:] - step.means[:, :-1]
-    count = step.sampling.count
-    variances = np.array([o.spread for o in step.obstacles]) ** 2
-    growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0)) / count
-    length: FloatArray = np.sqrt(np.add.reduce(way * way, axis=2))
-    return length + _SIGMAS * np.repeat(growth, count, axis=1)
