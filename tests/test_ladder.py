@@ -131,7 +131,7 @@ def test_predictions_of_time_are_long_times_slowly_forgotten():
     tries = 1
     while not watch.affords("program"):  # what was never begun must not be shut out for ever
         tries += 1
-    assert 3 < tries < 30
+    assert 10 < tries < 60
     assert Stopwatch(None, pace).affords("program")
 
 
@@ -172,7 +172,7 @@ def test_a_slow_solver_stops_the_search_and_is_counted(monkeypatch):
     assert known.status in (Status.PREVIOUS, Status.BRAKING)
     assert mpc.counts[known.status] == 1
     monkeypatch.undo()
-    for _ in range(60):
+    for _ in range(400):
         again = mpc.step(*step)
     assert again.status is Status.CONVERGED  # and forgotten in time
 
