@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test check format bench clean
+.PHONY: demo test check format bench risk soak clean
 
 demo: $(VENV)/.demo  ## run the report's four scenarios; tables and pictures go to out/
 	$(BIN)/scp-mpc report --out $(OUT)
@@ -23,6 +23,12 @@ format: $(VENV)/.dev  ## let ruff mend what it can
 
 bench: $(VENV)/.dev  ## all benchmarks; tables, figures and numbers go to benchmarks/results
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
+
+risk: $(VENV)/.dev  ## promised against measured risk, by Monte Carlo
+	$(BIN)/python benchmarks/risk.py --out $(OUT)/risk
+
+soak: $(VENV)/.dev  ## a million control steps with faults; stop it and go on as you like
+	$(BIN)/python benchmarks/soak.py --out $(OUT)/soak
 
 clean:
 	rm -rf $(VENV) $(OUT) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

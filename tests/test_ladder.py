@@ -145,30 +145,32 @@ def test_so_many_ways_as_fit_in():
 
 
 def slowed(monkeypatch, seconds):
-    run = active_set.ActiveSetSolver._run
+    """Make every dense program take so long; returns the list of those begun."""
+    run, begun = active_set.ActiveSetSolver._run, []
 
     def slow(self, *given):
+        begun.append(self)
         time.sleep(seconds)
         return run(self, *given)
 
     monkeypatch.setattr(active_set.ActiveSetSolver, "_run", slow)
+    return begun
 
 
 def test_a_slow_solver_stops_the_search_and_is_counted(monkeypatch):
-    """Programs ten times as long as the deadline: one at most is begun, then none."""
+    """Programs ten times as long as the deadline: one descent is begun, then none."""
     mpc, step = MPC(problem(N), Settings(deadline=0.02)), closing(2.0)
     for _ in range(3):
         mpc.step(*step)
     quick = mpc.overruns
-    slowed(monkeypatch, 0.2)
-    began = time.perf_counter()
+    begun = slowed(monkeypatch, 0.2)
     late = mpc.step(*step)
-    assert time.perf_counter() - began < 0.5
+    assert 1 <= len(begun) <= 2
     assert mpc.overruns == quick + 1
     assert late.candidates == ()
-    began = time.perf_counter()
+    begun.clear()
     known = mpc.step(*step)  # now it is known that programs take too long
-    assert time.perf_counter() - began < 0.1
+    assert not begun
     assert known.status in (Status.PREVIOUS, Status.BRAKING)
     assert mpc.counts[known.status] == 1
     monkeypatch.undo()
