@@ -307,11 +307,11 @@ def test_06_a_slow_solver_is_stopped_at_the_deadline(monkeypatch):
 
 
 def test_06_overruns_are_counted(monkeypatch):
-    mpc = MPC(problem(N), Settings(deadline=0.01))
+    mpc = MPC(problem(N), Settings(deadline=0.1))
     for _ in range(5):
         mpc.step(REF[0], REF)
     quick = mpc.overruns
-    Slow(monkeypatch, 0.03)
+    Slow(monkeypatch, 0.3)
     for _ in range(3):
         mpc.step(REF[0], REF, [obstacle(N, (1.5, 0.1))])
     # The first one is late; then it is known that a program takes too long, and none is begun.
