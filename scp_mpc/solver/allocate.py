@@ -25,7 +25,7 @@ def allocate(engine: Engine, step: StepData, watch: Stopwatch, best: Descent) ->
         return best
     risks = np.full(step.radii.shape, margin.delta / step.radii.size)
     for _ in range(_ROUNDS):
-        if not (best.status.ok and best.iterate.touches and watch.affords("first program")):
+        if not (best.status.ok and best.iterate.touches and watch.affords(engine.sampling.first)):
             break
         risks = reallocated(risks, point_risks(step, engine.path(best.iterate)))
         engine.widen(step.scaled(size_at_risk(risks)))

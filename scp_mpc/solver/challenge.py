@@ -53,7 +53,7 @@ class Challenge:
 
     def run(self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent) -> Found:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        most = watch.room("way", MAX_CANDIDATES, then="first program")
+        most = watch.room("way", MAX_CANDIDATES, then=engine.sampling.first)
         if not most:
             return Found(best)
         began = watch.elapsed
@@ -72,7 +72,7 @@ class Challenge:
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
         # A plan with slack is followed by any without: then all ways are worth their time.
         for start in ranked[: self._settings.rivals] if safe else ranked:
-            if (not safe and goal.status.ok) or not watch.affords("first program"):
+            if (not safe and goal.status.ok) or not watch.affords(engine.sampling.first):
                 break
             if safe and same_way(step, Passing(start.path, start.touched), here):
                 continue  # this way leads to where we are

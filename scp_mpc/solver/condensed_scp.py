@@ -102,7 +102,7 @@ class CondensedSCP:
         at, c, data = self._at, self._condensed, self._at.data
         if not data.count:  # the free plan was the only one, and it did not hold up
             return None
-        if not at.watch.affords("first program"):
+        if not at.watch.affords(c.sampling.first):
             return None
         began = at.watch.elapsed
         p = c.sampling.positions(nominal.states, nominal.inputs) - data.track[1:]
@@ -128,7 +128,7 @@ class CondensedSCP:
             at.watch.learn("landing", landing)
             if missed is None:
                 return last
-            if iterations >= limit or not at.watch.affords("first program"):
+            if iterations >= limit or not at.watch.affords(c.sampling.first):
                 return last
             began = at.watch.elapsed
             bounds = end.active[: len(bounds)]

@@ -81,13 +81,14 @@ class Newton:
         tangent, end, leaps, bold = self._conflicts.tangent(y), None, 0, True
         watch = self._step.watch
         for iteration in range(1, limit + 1):
-            task = "first program" if iteration == 1 else "program"
+            task = self._step.condensed.sampling.first if iteration == 1 else "program"
             if iteration > 1:
                 if not watch.affords(task):
                     break
                 began = watch.elapsed
             solved = self._solve(tangent, active)
             if solved is None:
+                watch.learn(task, began)  # it takes at least as long
                 if watch.remaining < 0:
                     break
                 return None

@@ -59,19 +59,25 @@ class Resolution:
     def refined(
         self, step: StepData, watch: Stopwatch, last: Iterate | None
     ) -> tuple[Engine, StepData, Descent | None]:
-        """Go on between the samples, if the free plan or the last one is too fast for less."""
+        """Go on between the samples, if the free plan or the last one is too fast for less.
+
+        Where there is no time for it, the samples have to do: their radii leave room for all that
+        happens in a whole interval.
+        """
         coarse, fine = self.coarse, self.fine
         if not self._covers_gaps or not step.count:
             return coarse, step, None
         sweep = coarse.free_sweep()
         if last is not None:
             sweep = sweep.and_more(coarse.sweep(last))
-        if not too_fast(step, sweep):
+        if not too_fast(step, sweep) or not watch.affords("refining", fine.sampling.first):
             return coarse, step, None
+        began = watch.elapsed
         step = step.sampled(fine.sampling)
         fine.begin(step, watch, like=coarse)
         wide = self.widened(fine, step, fine.free_sweep())
         best = fine.unhindered()
+        watch.learn("refining", began)
         return fine, step if best is None else wide, best
 
     def finished(self, engine: Engine) -> Counter[str]:
@@ -102,8 +108,8 @@ class Resolution:
         return bool(depths.max(initial=0.0) <= self._tolerance)
 
     def finer(self, engine: Engine, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData]:
-        """Where to go on after a plan that was not kept: between the samples, if not there yet."""
-        if engine is self.fine:
+        """Where to go on after a plan that was not kept: between the samples, if there is time."""
+        if engine is self.fine or not watch.affords("refining", self.fine.sampling.first):
             return engine, step
         step = step.sampled(self.fine.sampling)
         self.fine.begin(step, watch, like=self.coarse)

@@ -25,11 +25,13 @@ class Sampling:
 
     Attributes:
         points: N K.
+        first: What clocks call a descent's first program with so many points.
     """
 
     def __init__(self, model: LinearModel, horizon: int, count: int) -> None:
         """Find the positions' dependence on state and input."""
         self.count, self.points = count, horizon * count
+        self.first = f"first program, {count}"
         self._position, self._shape = model.position, (horizon, model.nx)
         maps = [model.between(k / count) for k in range(1, count)]
         self.C = np.concatenate([np.zeros((0, model.nx)), *(C for C, _ in maps)])

@@ -92,13 +92,14 @@ class Stopwatch:
         """Seconds until the deadline, negative after it; infinite without one."""
         return self._deadline - self.elapsed
 
-    def affords(self, task: str) -> bool:
-        """Whether a task, and what ends the step, are predicted to end before the deadline."""
+    def affords(self, *tasks: str) -> bool:
+        """Whether some tasks, and what ends the step, are predicted to end before the deadline."""
         if self._deadline == inf:
             return True
-        if self._pace.expected(task) + self._after <= self.remaining:
+        if sum(map(self._pace.expected, tasks)) + self._after <= self.remaining:
             return True
-        self._pace.ease(task)
+        for task in tasks:
+            self._pace.ease(task)
         return False
 
     def room(self, task: str, most: int, then: str) -> int:
