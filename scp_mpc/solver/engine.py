@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cached_property
 from math import inf
 
 import numpy as np
@@ -33,19 +32,15 @@ class Engine:
     """
 
     def __init__(self, problem: Problem, settings: Settings, count: int) -> None:
-        """Condense the problem, if it can be."""
+        """Condense the problem, if it can be, and lay out the sparse one."""
         self._problem, self._settings = problem, settings
         self.sampling = Sampling(problem.model, problem.horizon, count)
         self._condensed = (
             CondensedSCP.of(problem, settings, self.sampling) if settings.condense else None
         )
+        self.sparse = SparseSCP(problem, settings, self.sampling)
         self._fresh = False
         self._full_sag = _full_sag(problem, count)
-
-    @cached_property
-    def sparse(self) -> SparseSCP:
-        """The sparse problem, laid out when it is first asked for."""
-        return SparseSCP(self._problem, self._settings, self.sampling)
 
     @property
     def primary(self) -> CondensedSCP | SparseSCP:
@@ -80,8 +75,7 @@ class Engine:
 
     def forget(self) -> None:
         """Forget what earlier programs left behind."""
-        if "sparse" in self.__dict__:
-            self.sparse.forget()
+        self.sparse.forget()
 
     def path(self, iterate: Iterate) -> FloatArray:
         """Positions (C, d) of an iterate."""

@@ -36,7 +36,6 @@ class Resolution:
     def __init__(self, problem: Problem, settings: Settings) -> None:
         """Set both engines up."""
         self.coarse = self.fine = Engine(problem, settings, 1)
-        self.coarse.sparse  # noqa: B018 - laid out now, not in the first step that needs it
         self._tolerance = settings.tolerance
         self._covers_gaps = problem.subsamples > 1
         if self._covers_gaps:
