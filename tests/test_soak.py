@@ -115,8 +115,8 @@ def test_the_soak_would_notice_faults(monkeypatch):
     step = MPC.step
     monkeypatch.setattr("scp_mpc.comparison.soak_chunk._TWIN", 0.0)
 
-    def broken(self, x0, x_ref, obstacles=()):
-        plan = step(self, np.nan_to_num(x0), x_ref, obstacles)
+    def broken(self, x0, x_ref, obstacles=(), **named):
+        plan = step(self, np.nan_to_num(x0), x_ref, obstacles, **named)
         broken.calls += 1
         if broken.calls % 10 == 1:
             return replace(plan, U=plan.U * np.nan)
@@ -140,9 +140,9 @@ def test_the_soak_would_notice_a_trace_of_a_bad_call(monkeypatch):
     """A controller that forgets its last plan when it is called badly."""
     step = MPC.step
 
-    def forgetful(self, *given):
+    def forgetful(self, *given, **named):
         try:
-            return step(self, *given)
+            return step(self, *given, **named)
         except InvalidArgumentError:
             self.reset()
             raise
