@@ -177,6 +177,25 @@ def test_radii_leave_room_for_the_way_between_two_points():
         if (np.linalg.norm(path, axis=1) >= np.append(r, r[-1])).all():
             assert np.linalg.norm(between, axis=2).min() >= 0.35
     assert Sweep.of(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.8]])).sag == pytest.approx(0.1)
+    np.testing.assert_allclose(swept(step, Sweep(0.0, 0.1)).radii, 0.45)
+    np.testing.assert_allclose(swept(step, Sweep(0.6, 0.05)).radii, 0.5)
+
+
+@pytest.mark.parametrize("K", [2, 4])
+def test_a_plan_that_outruns_what_was_assumed_is_not_called_safe(monkeypatch, K):
+    """Assume that nothing moves between two points: the plan's own way is checked all the same."""
+    monkeypatch.setattr(Sweep, "of", lambda _: Sweep(0.0, 0.0))
+    ref, case = straight_reference(N, 4.0), problem(N, robot_radius=0.1, subsamples=K)
+    for x in (4.4, 4.3, 4.2):
+        careless = SCP(case).solve(ref[0], ref, [thin(x)])
+        if careless.ok and gap(careless, thin(x)) < 0.15:
+            break
+    else:
+        pytest.fail("the assumption does not matter here")
+    monkeypatch.undo()
+    monkeypatch.setattr(Sweep, "and_more", lambda *_: Sweep(0.0, 0.0))
+    checked = SCP(case).solve(ref[0], ref, [thin(x)])
+    assert not checked.ok or gap(checked, thin(x)) >= 0.15
 
 
 def test_the_risk_of_an_interval_is_shared_by_its_points():
@@ -218,7 +237,9 @@ def test_certificate_and_optimum_agree_with_ipopt(seed, s_min, condense):
     Sigma = rotated((0.25, 0.1), rng.uniform(0, np.pi))
     ahead = obstacle(N, (5.0, rng.uniform(-0.3, 0.3)), (0.5, rng.uniform(-0.1, 0.1)), Sigma)
     patient = Settings(condense=condense, max_iterations=200)
-    plan = SCP(case, patient).solve(ref[0], ref, [ahead])
+    x0 = ref[0] + [-0.2, 0.3, 0.15, -0.2]  # neither here nor along the reference at rest
+    ref[:, 3] += 0.1
+    plan = SCP(case, patient).solve(x0, ref, [ahead])
     assert plan.status is Status.CONVERGED
     step = plan.commitment.args[0]
     assert step.sampling.count == 4

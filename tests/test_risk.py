@@ -21,6 +21,7 @@ from scp_mpc import (
 )
 from scp_mpc.safety import NoGoSets, containment_size, risk_bound, size_at_risk
 from scp_mpc.safety.allocation import reallocated
+from scp_mpc.solver.commitment import point_risks
 
 S95 = 5.991**0.5
 
@@ -149,6 +150,19 @@ def test_plans_commit_to_no_more_than_promised(delta, subsamples):
     assert iterative.cost < 0.97 * uniform.cost
     # One point in fifteen times two obstacles: a joint promise costs more than one per stage.
     assert stage.cost < uniform.cost
+
+
+def test_an_interval_answers_for_the_points_at_both_ends():
+    plan = solved(StageRisk(0.05), 4)
+    step, iterate = plan.commitment.args
+    path = step.sampling.positions(iterate.states, iterate.inputs)
+    points = point_risks(step, path)
+    K = step.sampling.count
+    for i in range(15):
+        own = points[:, i * K : (i + 1) * K].sum(axis=1)
+        before = points[:, i * K - 1] if i else 0.0
+        np.testing.assert_allclose(plan.risk.stages[:, i], own + before)
+    assert plan.risk.joint == pytest.approx(points.sum())
 
 
 def test_a_promise_for_one_obstacle_does_not_pay_for_empty_slots():
