@@ -91,3 +91,14 @@ def test_a_stack_equals_its_parts():
             one_sd, one_n = signed_distance(y[j, i], e[j, i])
             assert sd[j, i] == pytest.approx(one_sd, abs=1e-12)
             np.testing.assert_allclose(n[j, i], one_n, atol=1e-9)
+
+
+def test_what_counts_as_zero_is_not_measured_by_a_huge_neighbour():
+    """Ellipses from a line to a thousand kilometres: each as if it were alone."""
+    y = np.array([[0.1, 1e-8], [3e5, 2e5], [0.2, 0.1]])
+    semi_axes = np.array([[0.3, 0.0], [8e5, 8e5], [0.3, 1e-7]])
+    together, normals = signed_distance(y, semi_axes)
+    for k in range(3):
+        alone, normal = signed_distance(y[k], semi_axes[k])
+        assert together[k] == alone
+        np.testing.assert_array_equal(normals[k], normal)

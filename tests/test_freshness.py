@@ -11,7 +11,6 @@ from instances import DT, obstacle, problem, straight_reference
 
 from scp_mpc import (
     MPC,
-    SCP,
     BoundsError,
     ConcurrentUseError,
     Freshness,
@@ -27,7 +26,6 @@ from scp_mpc import (
 from scp_mpc.control.memory import ObstacleMemory
 from scp_mpc.obstacles import aged
 
-needs_brake = pytest.mark.skipif(not hasattr(SCP, "brake"), reason="SCP.brake is not there yet")
 NAN = np.nan
 
 
@@ -202,7 +200,6 @@ def test_a_report_that_is_too_old_is_refused_where_so_configured():
     assert state(mpc) == before
 
 
-@needs_brake
 def test_a_report_that_is_too_old_brakes(caplog):
     mpc = controller(stop_after=0.5)
     x, speeds = np.array([0.0, 2.0, 0.0, 0.4]), []
@@ -222,12 +219,10 @@ def test_a_report_that_is_too_old_brakes(caplog):
     assert plan.ok, plan.status
 
 
-@needs_brake
 def test_an_absurdly_old_report_brakes_too():
     assert step(controller(), seen(stamp=-9e14), time=9e14).status is Status.STALE
 
 
-@needs_brake
 @pytest.mark.parametrize(
     ("change", "error"),
     [
@@ -247,7 +242,6 @@ def test_bad_arguments_are_refused_before_braking(change, error):
     assert state(mpc) == before
 
 
-@needs_brake
 def test_what_was_too_old_is_kept_when_it_vanishes():
     mpc = controller()
     report = seen(stamp=8.5, name="a")
@@ -386,7 +380,6 @@ def test_a_second_thread_is_refused_before_anything_is_read():
     mpc.reset()
 
 
-@needs_brake
 @pytest.mark.parametrize("wrong", [NAN, np.inf, 3.001, -3.001])
 def test_the_input_is_checked_last(monkeypatch, caplog, wrong):
     mpc = controller()
@@ -406,7 +399,6 @@ def test_the_input_is_checked_last(monkeypatch, caplog, wrong):
     assert np.isfinite(step(mpc).X).all()
 
 
-@needs_brake
 def test_even_a_brake_that_is_broken_gives_an_input_within_its_bounds(monkeypatch):
     mpc = controller()
     plan = step(mpc)

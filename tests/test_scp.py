@@ -18,7 +18,7 @@ from scp_mpc import (
 )
 from scp_mpc.solver import KKTResiduals
 from scp_mpc.solver.acceleration import Anderson
-from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.descent import Descent, judge
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.trusted import TrustedSolver
 
@@ -336,3 +336,14 @@ def test_an_extrapolation_that_costs_more_is_taken_back(monkeypatch):
     assert rejected
     assert plan.status is Status.CONVERGED
     assert plan.cost == pytest.approx(expected.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_what_is_not_a_number_is_never_judged_safe(which):
+    values = [0.0] * 4
+    values[which] = np.nan
+    verdict = judge(KKTResiduals(*values[:3]), values[3], 1e-6)
+    assert verdict is not Status.CONVERGED
+    assert not verdict.certified
+    if which in (1, 3):  # of feasibility and slack
+        assert verdict is Status.VIOLATING

@@ -78,6 +78,6 @@ def hopeless(iterations: int, merit: float, goal: Descent) -> bool:
 def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
     """Return the status of a plan with the given residuals and largest slack [m]."""
     inside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
-    if residuals.worst <= tolerance:
+    if residuals.worst <= tolerance and slack == slack:
         return Status.SOFTENED if inside else Status.CONVERGED
     return Status.VIOLATING if inside else Status.FEASIBLE

@@ -6,6 +6,7 @@ Sign of the multipliers: P x + q + A'y = 0 with y > 0 at upper and y < 0 at lowe
 """
 
 from dataclasses import dataclass, field
+from math import isnan
 
 import numpy as np
 from scipy import sparse
@@ -31,8 +32,8 @@ class KKTResiduals:
     @property
     def worst(self) -> float:
         """The largest of the three; NaN counts as infinite."""
-        worst = max(self.stationarity, self.feasibility, self.complementarity)
-        return worst if worst == worst else np.inf
+        three = self.stationarity, self.feasibility, self.complementarity
+        return np.inf if isnan(sum(three)) else max(three)  # max() may pass over NaN
 
 
 @dataclass(frozen=True, eq=False)
