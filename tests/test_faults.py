@@ -1,67 +1,35 @@
-"""The fourteen faults that break controllers of this kind, one check or small group for each.
+"""The fourteen faults that break controllers of this kind, 1 to 7: data, geometry, time, limits.
 
-What a plan claims is judged by `judge.py`, which shares no code with the package. Any single step
-is in `test_steps_property.py`, any sequence of steps (check 12) in `test_machine.py`.
+One check or small group for each; 8 to 14 are in `test_faults_over_time.py`. What a plan claims is
+judged by `judge.py`, which shares no code with the package. Any single step is in
+`test_steps_property.py`, any sequence of steps (check 12) in `test_machine.py`.
 """
 
-import os
-import subprocess
-import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from driving import N, bits, drive, good, same
-from instances import S_REF, instance, obstacle, problem, rotated, straight_reference
-from judge import judge
-from scipy import stats
+from driving import N, good, same
+from holding import INF, NAN, ON_TOP, REF, WALL, hold, solve_and_hold
+from instances import obstacle, problem, rotated, straight_reference
 
 from scp_mpc import (
     MPC,
     SCP,
-    ConcurrentUseError,
     CovarianceError,
     DoubleIntegrator,
     Freshness,
     InvalidArgumentError,
-    Margin,
     NotFiniteError,
     ObstaclePrediction,
     Settings,
     ShapeError,
     StaleDataError,
     Status,
-    TooManyObstaclesError,
 )
 from scp_mpc.solver.active_set import ActiveSetSolver
-from scp_mpc.solver.oracle import Oracle
-from scp_mpc.solver.qp import QPStatus
-from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.subproblem import Subproblem
 from scp_mpc.solver.trusted import TrustedSolver
-
-NAN, INF = np.nan, np.inf
-REF = straight_reference(N)
-ON_TOP = ObstaclePrediction(REF[:, [0, 2]], 0.04 * np.eye(2), 0.2)
-WALL = [ObstaclePrediction(np.tile([1.2, y], (N + 1, 1)), 0.3 * np.eye(2), 0.4) for y in (-1, 1)]
-
-
-def hold(case, x0, x_ref, obstacles, plan):
-    """What every plan must be, whatever happened."""
-    assert np.isfinite(plan.U).all(), plan.status
-    assert (plan.u0 >= case.u_min).all()
-    assert (plan.u0 <= case.u_max).all()
-    assert judge(case, x0, x_ref, obstacles, plan).complaints == []
-
-
-def solve_and_hold(case, x0, x_ref, obstacles, settings=None):
-    plan = SCP(case, settings).solve(x0, x_ref, obstacles)
-    hold(case, x0, x_ref, obstacles, plan)
-    return plan
-
 
 # 1. Covariances
 
@@ -337,257 +305,3 @@ def test_07_inputs_are_within_limits_whatever_the_status(low, high, condense):
             if k == 1:  # the robot is carried off
                 plan = mpc.step(REF[0] + 50.0, REF, present)
                 hold(case, REF[0] + 50.0, REF, present, plan)
-
-
-# 8. Determinism
-
-BITS = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from driving import N, bits, drive
-from instances import problem
-from scp_mpc import MPC
-print(bits(drive(MPC(problem(N)), 12)))
-"""
-
-
-def test_08_same_bits_in_every_run_process_and_after_reset():
-    mpc = MPC(problem(N))
-    here = bits(drive(mpc, 12))
-    drive(mpc, 3)
-    mpc.reset()
-    assert bits(drive(mpc, 12)) == here
-    command = [sys.executable, "-c", BITS, str(Path(__file__).parent)]
-    for seed in ("1", "2"):  # of Python's hashes
-        done = subprocess.run(
-            command,
-            env=os.environ | {"PYTHONHASHSEED": seed},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert done.stdout.strip() == here
-
-
-# 9. Memory
-
-
-def resident():
-    """Bytes in memory."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE")
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc on this system")
-def test_09_memory_is_flat_over_ten_thousand_steps():
-    case = problem(4, max_obstacles=2)
-    ref = straight_reference(4)
-    near, far = obstacle(4, (0.9, 0.3)), obstacle(4, (30.0, 0.0))
-    worlds = [[far], [], [far, far], [near]]
-    mpc = MPC(case, Settings(sides=False))
-
-    def run(steps):
-        for k in range(steps):
-            mpc.step(ref[0], ref, worlds[3 if k % 200 == 0 else k % 3])
-
-    run(1000)
-    before = resident()
-    run(10_000)
-    assert resident() - before < 5e6
-
-
-# 10. Threads
-
-
-def test_10_two_controllers_in_two_threads_equal_serial():
-    def run(seed):
-        start = drive(MPC(problem(N)), 4 + seed)
-        return bits(start)
-
-    serial = [run(seed) for seed in range(4)]
-    with ThreadPoolExecutor(2) as pool:
-        assert list(pool.map(run, range(4))) == serial
-
-
-def test_10_two_threads_in_one_controller_raise_and_leave_no_trace():
-    """The second comes while the first waits inside its step."""
-    mpc = MPC(problem(N))
-
-    def waiting(pool):
-        other = pool.submit(mpc.step, REF[0], REF)
-        with pytest.raises(ConcurrentUseError):
-            other.result()
-        yield obstacle(N, (1.5, 0.1))
-
-    with ThreadPoolExecutor(1) as pool:
-        disturbed = mpc.step(REF[0], REF, waiting(pool))
-    alone = MPC(problem(N)).step(REF[0], REF, [obstacle(N, (1.5, 0.1))])
-    assert same([disturbed], [alone])
-
-
-# 11. Arguments
-
-
-def test_11_arguments_stay_as_they_are_and_may_come_in_any_form():
-    """Exactly representable numbers, so that every type holds the same ones."""
-    x0 = np.array([0.0, 2.0, 0.25, 0.0])
-    x_ref = np.round(REF * 8) / 8
-    means = np.tile([1.5, 0.125], (N + 1, 1))
-    covariances = np.tile([[0.0625, 0.03125], [0.03125, 0.125]], (N + 1, 1, 1))
-    arrays = (x0, x_ref, means, covariances)
-    before = [a.tobytes() for a in arrays]
-
-    def solved(x0, x_ref, means, covariances):
-        mpc = MPC(problem(N))
-        thing = [ObstaclePrediction(means, covariances, 0.25)]
-        return [mpc.step(x0, x_ref, thing) for _ in range(2)]
-
-    plain = solved(*arrays)
-    forms = [
-        lambda a: a.tolist(),
-        lambda a: np.repeat(a, 2, axis=0)[::2],
-        lambda a: a[::-1].copy()[::-1],
-        np.asfortranarray,
-        lambda a: a.astype(np.float32),
-        lambda a: tuple(a),
-    ]
-    for form in forms:
-        assert same(plain, solved(*map(form, arrays)))
-    whole = [np.round(a) for a in (x0, x_ref, means, covariances)]
-    assert same(solved(*whole), solved(*(a.astype(np.int64) for a in whole)))
-    assert before == [a.tobytes() for a in arrays]
-
-
-# 12. Mixed calls, a short one; any sequence of them is in test_machine.py
-
-
-def test_12_bad_calls_among_good_ones_leave_no_trace():
-    mpc, twin = MPC(problem(N)), MPC(problem(N))
-    bad = [
-        ({"x0": [NAN] * 4}, NotFiniteError),
-        ({"x_ref": REF[:-1]}, ShapeError),
-        ({"obstacles": [ON_TOP] * 2}, TooManyObstaclesError),
-        ({"obstacles": 3}, InvalidArgumentError),
-    ]
-    for change, error in bad:
-        with pytest.raises(error):
-            mpc.step(**(good() | change))
-        assert same([mpc.step(**good())], [twin.step(**good())])
-        if error is ShapeError:
-            mpc.reset()
-            twin.reset()
-
-
-# 13. A second opinion
-
-
-@pytest.mark.parametrize("inflation", ["exact", "axes"])
-@pytest.mark.parametrize("kind", ["ahead", "beside", "crossing", "elongated"])
-def test_13_another_solver_finds_the_same_program_solved(kind, inflation):
-    """The program about a converged plan, written anew from the caller's data, is solved by it."""
-    case = instance(kind, 8, inflation, S_REF, 1)
-    plan = SCP(case.problem).solve(case.x0, case.x_ref, case.obstacles)
-    hold(case.problem, case.x0, case.x_ref, case.obstacles, plan)
-    if not plan.ok:
-        return
-    step = StepOf(case)
-    solution = Oracle("clarabel").solve(step.program_about(plan))
-    assert solution.status is QPStatus.SOLVED
-    theirs = step.subproblem.unpack(solution.x, solution.y)
-    np.testing.assert_allclose(theirs.inputs, plan.U, atol=1e-3)
-    mine, other = (step.cost(v) for v in (plan.U, theirs.inputs))
-    assert mine == pytest.approx(other, rel=1e-5)
-
-
-class StepOf:
-    """The sparse program of a control step."""
-
-    def __init__(self, case):
-        self.case = case
-        self.step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
-        self.subproblem = Subproblem(case.problem)
-        self.subproblem.write_step(self.step.x0, self.step.x_ref)
-
-    def program_about(self, plan):
-        spaces = self.step.half_spaces(plan.X, plan.iterate.s)
-        self.subproblem.write_half_spaces(spaces)
-        return self.subproblem.program
-
-    def cost(self, U):
-        """Of inputs alone, by a plain loop."""
-        problem, x, total = self.case.problem, self.case.x0, 0.0
-        for u, ref in zip(U, self.case.x_ref[1:], strict=True):
-            x = problem.model.A @ x + problem.model.B @ u
-            total += (x - ref) @ problem.Q @ (x - ref) + u @ problem.R @ u
-        return total
-
-
-@pytest.mark.parametrize("condense", [True, False])
-def test_13_kkt_conditions_hold_in_terms_of_the_callers_data(condense):
-    """A swallowed update would leave the certificate of another program.
-
-    With the obstacles' forces from the plan's own multipliers, the gradient with respect to the
-    inputs is made anew by a plain adjoint loop; it must vanish where an input is between its
-    limits and push outwards where it is not.
-    """
-    case = instance("ahead", 8, "exact", S_REF, 2)
-    problem_ = case.problem
-    mpc = MPC(problem_, Settings(condense=condense))
-    mpc.step(case.x0 + 0.3, case.x_ref, [obstacle(8, (1.0, 0.4))])
-    plan = mpc.step(case.x0, case.x_ref, case.obstacles)
-    assert plan.status.certified
-    A, B, position = problem_.model.A, problem_.model.B, problem_.model.position
-    force = plan.multipliers.obstacles[0]
-    assert (force <= 0).all()
-    assert force.min() < -1e-3
-    reach = problem_.robot_radius + case.obstacles[0].radius
-    costate, gradient = np.zeros(4), np.zeros_like(plan.U)
-    for i in range(8, 0, -1):
-        mu, Sigma = case.obstacles[0].means[i], case.obstacles[0].covariances[i]
-        pull = np.zeros(4)
-        if force[i - 1] < 0:
-            n, distance = nearest(plan.X[i, position] - mu, Sigma, plan.s[0])
-            pull[position] = force[i - 1] * n
-            assert abs(force[i - 1] * (distance - reach)) < 1e-5
-        Q = problem_.Qf if i == 8 else problem_.Q
-        costate = A.T @ costate + 2 * Q @ (plan.X[i] - case.x_ref[i]) + pull
-        gradient[i - 1] = B.T @ costate + 2 * problem_.R @ plan.U[i - 1]
-    low, high = problem_.u_min + 1e-9 >= plan.U, problem_.u_max - 1e-9 <= plan.U
-    assert np.abs(gradient[~low & ~high]).max(initial=0.0) < 1e-5
-    assert (gradient[low] > -1e-5).all()
-    assert (gradient[high] < 1e-5).all()
-
-
-def nearest(y, Sigma, s):
-    """Outward normal and signed distance, by a fan of directions and bisection."""
-    low, high = -np.pi, np.pi
-    for _ in range(14):
-        t = np.linspace(low, high, 721)
-        n = np.stack([np.cos(t), np.sin(t)], axis=1)
-        values = n @ y - s * np.sqrt(np.einsum("ki,ij,kj->k", n, Sigma, n))
-        best = values.argmax()
-        low, high = t[max(best - 1, 0)], t[min(best + 1, 720)]
-    return n[best], values[best]
-
-
-# 14. Measured risk
-
-
-@pytest.mark.parametrize("delta", [0.1, 0.05])
-def test_14_collisions_are_as_rare_as_promised(delta):
-    """Per stage, with the exact no-go set; the upper end of the 95 % interval decides."""
-    s = float(stats.norm.isf(delta))
-    case = problem(N, margin=Margin(reference=s, lower=s))
-    thing = obstacle(N, (1.6, 0.1), covariance=rotated((0.45, 0.15), 0.6))
-    plan = solve_and_hold(case, REF[0], REF, [thing])
-    assert plan.ok
-    rng, samples = np.random.default_rng(0), 5_000
-    worst = 0.0
-    for i in range(1, N + 1):
-        centres = rng.multivariate_normal(thing.means[i], thing.covariances[i], samples)
-        gaps = np.linalg.norm(centres - plan.X[i, [0, 2]], axis=1)
-        hits = int((gaps < case.robot_radius + thing.radius).sum())
-        interval = stats.binomtest(hits, samples).proportion_ci(0.95, method="exact")
-        worst = max(worst, interval.high)
-    assert worst <= delta
-    assert worst > delta / 100  # the obstacle was in the way
