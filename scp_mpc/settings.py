@@ -94,8 +94,8 @@ class Settings:
         sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
         sides_interval: Control steps between two such attempts while it keeps shaping the plan.
         rivals: How many of the ways past it to follow to the end; all are ranked.
-        deadline: Seconds after which no iteration is begun once there is a plan; other sides are
-            left out when half of them are gone. None: take the time it takes.
+        deadline: Seconds in which a step is to end: nothing is begun that is predicted, from how
+            long it took lately, to end later. None: take the time it takes.
         qp: Settings of the quadratic program's solvers.
         freshness: How old predictions may be; for the controller `MPC` alone.
     """

@@ -6,12 +6,12 @@ Nothing here changes before `commit`: a step that fails in between leaves no tra
 import logging
 from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import InvalidArgumentError, StaleDataError
 from scp_mpc.obstacles.ageing import aged
-from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.settings import Freshness
 
 _log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class ObstacleMemory:
             StaleDataError: `time` runs backwards, a stamp is in the future, or one that is
                 required is missing.
         """
-        given = _predictions(obstacles)
+        given = as_predictions(obstacles)
         required = self._freshness.stamps == "required"
         now = self._now(time, required)
         plain = all(o.stamp is None and o.name is None for o in given)
@@ -185,18 +185,6 @@ class ObstacleMemory:
             f"obstacles[{j}].stamp",
             f"{since[j]} s is {now - since[j]:g} s old, beyond stop_after = {limit:g} s",
         )
-
-
-def _predictions(obstacles: Any) -> tuple[ObstaclePrediction, ...]:
-    if isinstance(obstacles, ObstaclePrediction) or not isinstance(obstacles, Iterable):
-        raise InvalidArgumentError("obstacles", f"{obstacles!r} is not a list of predictions")
-    given = tuple(obstacles)
-    for j, obstacle in enumerate(given):
-        if not isinstance(obstacle, ObstaclePrediction):
-            raise InvalidArgumentError(
-                f"obstacles[{j}]", f"{obstacle!r} is not an ObstaclePrediction"
-            )
-    return given
 
 
 def _require_distinct(given: tuple[ObstaclePrediction, ...], names: int) -> None:

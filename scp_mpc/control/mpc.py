@@ -159,9 +159,8 @@ class MPC:
             )
         if self.settings.freshness.beyond == "refuse":
             raise recall.stale
-        StepData.read(
-            self.problem, x0, x_ref, recall.obstacles, robot_covariance
-        )  # bad arguments are refused first
+        # Bad arguments are refused before the robot brakes.
+        StepData.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
         _log.warning("%s: braking", recall.stale)
         return self._solver.brake(x0, x_ref, Status.STALE)
 

@@ -1,6 +1,6 @@
 """What the controller is told about one moving obstacle."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -116,3 +116,20 @@ def _require_hashable(name: object) -> None:
         hash(name)
     except TypeError:
         raise InvalidArgumentError("name", f"{name!r} is not hashable") from None
+
+
+def as_predictions(obstacles: object) -> tuple[ObstaclePrediction, ...]:
+    """Return any iterable of predictions as a tuple.
+
+    Raises:
+        InvalidArgumentError: It is none, or holds something else.
+    """
+    if isinstance(obstacles, ObstaclePrediction) or not isinstance(obstacles, Iterable):
+        raise InvalidArgumentError("obstacles", f"{obstacles!r} is not a list of predictions")
+    given = tuple(obstacles)
+    for j, obstacle in enumerate(given):
+        if not isinstance(obstacle, ObstaclePrediction):
+            raise InvalidArgumentError(
+                f"obstacles[{j}]", f"{obstacle!r} is not an ObstaclePrediction"
+            )
+    return given

@@ -198,6 +198,7 @@ class CondensedSCP:
         """An iterate's bounds and sizes about the plan y."""
         states = self._at.data.x_ref.copy()
         inputs = y[self._condensed.u].reshape(-1, self._problem.model.nu)
+        states[0] = self._at.data.x0
         states[1:] += self._condensed.deviations(inputs)
         return replace(best, states=states, inputs=inputs)
 

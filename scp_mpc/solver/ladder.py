@@ -1,8 +1,7 @@
 """The last rungs of the ladder: what to do when the search has no plan that meets every constraint.
 
 1. the certified plan       2. a feasible iterate
-3. the last plan, shifted: its inputs rolled out from the state now, and rechecked against the
-new predictions
+3. the last plan, shifted: its inputs from the state now, rechecked against the new predictions
 4. braking at the model's limits, checked likewise
 5. whatever violates least
 """

@@ -8,8 +8,7 @@ happens between two points (`sweep.py`).
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
-
+from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 from scp_mpc.solver.descent import Descent
@@ -100,11 +99,9 @@ class Resolution:
         """Whether a plan is clear between its points, too, for what it really does there."""
         if sweep is None or not best.status.ok:
             return True
-        moved = engine.sweep(best.iterate)
-        if sweep.covers(moved):
+        if sweep.covers(engine.sweep(best.iterate)):
             return True
-        depths = swept(step, moved).depths(engine.path(best.iterate), best.iterate.s)
-        return bool(depths.max(initial=0.0) <= self._tolerance)
+        return bool(_depths(engine, step, best.iterate).max(initial=0.0) <= self._tolerance)
 
     def finer(self, engine: Engine, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData]:
         """Where to go on after a plan that was not kept: between the samples, if there is time."""
@@ -115,7 +112,16 @@ class Resolution:
         return self.fine, step
 
 
-def exposed(best: Descent) -> Descent:
-    """A plan that is not clear between its points after all."""
-    residuals = replace(best.residuals, feasibility=np.inf)
-    return replace(best, status=Status.VIOLATING, residuals=residuals)
+def exposed(engine: Engine, step: StepData, best: Descent) -> Descent:
+    """A plan that is not clear between its points after all, with how far it is not."""
+    depths = _depths(engine, step, best.iterate)
+    slack = best.iterate.slack.copy()
+    slack[: step.count] = depths
+    iterate = replace(best.iterate, slack=slack).frozen()
+    residuals = replace(best.residuals, feasibility=float(depths.max()))
+    return replace(best, make=lambda: iterate, status=Status.VIOLATING, residuals=residuals)
+
+
+def _depths(engine: Engine, step: StepData, iterate: Iterate) -> FloatArray:
+    """How deep an iterate enters the no-go sets (J, C), for what it does between its points."""
+    return swept(step, engine.sweep(iterate)).depths(engine.path(iterate), iterate.s)

@@ -183,7 +183,7 @@ class SCP:
             start = found.best.iterate
             engine, step = self._resolution.finer(engine, step, watch)
         else:
-            found = replace(found, best=exposed(found.best))
+            found = replace(found, best=exposed(engine, step, found.best))
         plan = self._plan(wide, found, watch, self._resolution.finished(engine))
         watch.learn("ending", ending)
         return plan

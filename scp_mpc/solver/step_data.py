@@ -5,7 +5,7 @@ Notation:
     C       points at which they are constrained: N stages, or K in each interval
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import BoolArray, FloatArray, as_array, require_positive_semidefinite
-from scp_mpc.errors import InvalidArgumentError, ShapeError, TooManyObstaclesError
-from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.errors import ShapeError, TooManyObstaclesError
+from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.margin import Margin
@@ -71,16 +71,10 @@ class StepData:
         reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
         if reference.ndim == 1:
             reference = np.tile(reference, (N + 1, 1))
-        if isinstance(obstacles, ObstaclePrediction) or not isinstance(obstacles, Iterable):
-            raise InvalidArgumentError("obstacles", f"{obstacles!r} is not a list of predictions")
-        obstacles = tuple(obstacles)
+        obstacles = as_predictions(obstacles)
         if len(obstacles) > M:
             raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = {M}")
         for j, obstacle in enumerate(obstacles):
-            if not isinstance(obstacle, ObstaclePrediction):
-                raise InvalidArgumentError(
-                    f"obstacles[{j}]", f"{obstacle!r} is not an ObstaclePrediction"
-                )
             if obstacle.means.shape != (N + 1, model.dim):
                 raise ShapeError(
                     f"obstacles[{j}].means",
