@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from instances import S_REF, obstacle, problem, rotated, straight_reference
 
-from scp_mpc import DoubleIntegrator, ObstaclePrediction
+from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction
 from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
 from scp_mpc.solver.step_data import StepData
 
@@ -139,3 +139,24 @@ def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
     on_top[1:, [0, 2]] = centre.means[1:]
     normal = step.half_spaces(on_top, np.array([S_REF])).normal[0, 0]
     assert normal @ step.start[0] > 0
+
+
+def test_rivals_begin_at_the_state_not_at_the_reference(monkeypatch):
+    case, ref = problem(20), straight_reference(20)
+    solver, x0, starts = SCP(case), ref[0] + [-0.3, 0.2, 0.2, 0.0], []
+    engine = solver._resolution.coarse
+    glimpses = engine.glimpses
+
+    def noting(*given, **named):
+        found = glimpses(*given, **named)
+        starts.extend(start.iterate for start in found if np.isfinite(start.merit))
+        return found
+
+    monkeypatch.setattr(engine, "glimpses", noting)
+    solver.solve(x0, ref, [obstacle(20, (3.0, 0.1), (0.5, 0.0))])
+    assert starts
+    for start in starts:
+        np.testing.assert_array_equal(start.states[0], x0)
+        for i, u in enumerate(start.inputs):
+            expected = case.model.step(start.states[i], u)
+            np.testing.assert_allclose(start.states[i + 1], expected, atol=1e-9)
