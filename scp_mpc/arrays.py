@@ -34,6 +34,37 @@ def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Float
         ShapeError: The shape fits none of `shapes`.
         NotFiniteError: An entry is NaN or infinite.
     """
+    array = _as_real(argument, value, *shapes)
+    require_finite(argument, array)
+    return array
+
+
+def as_bound(argument: str, value: ArrayLike | None, size: int, none: float) -> FloatArray:
+    """Return bounds (size,) from a number, (size,) numbers, or None; frozen.
+
+    Args:
+        argument: Name used in error messages.
+        value: Lower or upper bounds; infinite entries bound nothing.
+        size: How many numbers they bound.
+        none: What stands for no bound: minus infinity for lower bounds, infinity for upper ones.
+
+    Raises:
+        InvalidArgumentError: The value is not numeric.
+        ShapeError: Neither a number nor `(size,)`.
+        NotFiniteError: An entry is NaN.
+        BoundsError: An entry is the infinity of the other side, or finite and beyond 1e15.
+    """
+    array = np.full(size, none)
+    if value is not None:
+        array[:] = _as_real(argument, value, (), (size,))
+    wrong = array == -none
+    if wrong.any():
+        raise BoundsError(argument, f"{-none} at index {int(np.argmax(wrong))} allows nothing")
+    require_finite(argument, np.where(array == none, 0.0, array))
+    return frozen(array)
+
+
+def _as_real(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "biuf":
@@ -46,7 +77,6 @@ def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> Float
     if shapes and not any(_fits(array.shape, shape) for shape in shapes):
         wanted = " or ".join(str(shape).replace("-1", "any") for shape in shapes)
         raise ShapeError(argument, f"shape {array.shape} does not fit {wanted}")
-    require_finite(argument, array)
     return array
 
 

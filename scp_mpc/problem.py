@@ -1,13 +1,24 @@
 """The frozen problem: what is minimised, over which horizon, within which limits.
 
     minimise   sum_{i=1..N} |x_i - xref_i|^2_Q + sum_{i=0..N-1} |u_i|^2_R + sum_j w (s_j - s_ref)^2
-    over       x_1..x_N, u_0..u_{N-1}, s_j
+               + v sum_{i=1..N} |e_i|_1
+    over       x_1..x_N, u_0..u_{N-1}, s_j, e_1..e_N
     subject to x_{i+1} = f(x_i, u_i),  x_0 given
                p_i outside the no-go set of obstacle j at stage i, sized by s_j
                (likewise at points within the interval before i, where the robot is fast)
                s_min <= s_j <= s_max,  u_min <= u_i <= u_max
+               du_min <= u_i - u_{i-1} <= du_max  (u_{-1} the input last applied, if it is known)
+               x_min - e_i <= x_i <= x_max + e_i,  e_i >= 0
 
-There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given.
+There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Bounds of states
+and of rates are there where they are given. Those of states give way at an exact price: where they
+can be kept, they are, and the excess e is reported where they cannot, as after a start outside
+them. Those of inputs and rates never give way; for there always to be such inputs, holding an input
+must be allowed: du_min <= 0 <= du_max.
+
+Notation:
+    e (N, nx)   excess of the states over their bounds: max(0, x - x_max, x_min - x)
+    v           `state_slack_weight`
 """
 
 from dataclasses import dataclass
@@ -17,7 +28,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray, as_array, as_count, as_number, as_weight, frozen
+from scp_mpc.arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    as_bound,
+    as_count,
+    as_number,
+    as_weight,
+    frozen,
+)
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
@@ -50,6 +70,15 @@ class Problem:
             nothing to pass between two points. 1: the samples as they are, as in the report.
         slack_weight: Cost per metre of slack and stage where the constraints cannot all be met.
             The penalty is exact as long as it exceeds the obstacles' multipliers.
+        x_min: Lower bounds of the states at stages 1 .. N, a number or (nx,); entries may be minus
+            infinity. None: no lower bounds.
+        x_max: Upper bounds likewise; entries may be infinity.
+        du_min: Lower bounds of the change u_i - u_{i-1} of the input from one interval to the next
+            [unit of the input per interval], a number or (nu,), never positive; entries may be
+            minus infinity. None: no lower bounds.
+        du_max: Upper bounds likewise, never negative; entries may be infinity.
+        state_slack_weight: Cost per unit and stage by which a state is outside its bounds. The
+            penalty is exact as long as it exceeds the state bounds' multipliers.
 
     Raises:
         InvalidArgumentError: Or one of its subclasses, with the argument and the number.
@@ -68,6 +97,11 @@ class Problem:
     max_obstacles: int
     subsamples: int
     slack_weight: float
+    x_min: FloatArray
+    x_max: FloatArray
+    du_min: FloatArray
+    du_max: FloatArray
+    state_slack_weight: float
 
     def __init__(
         self,
@@ -85,12 +119,19 @@ class Problem:
         max_obstacles: int = 1,
         subsamples: int = 4,
         slack_weight: float = 1e3,
+        x_min: ArrayLike | None = None,
+        x_max: ArrayLike | None = None,
+        du_min: ArrayLike | None = None,
+        du_max: ArrayLike | None = None,
+        state_slack_weight: float = 100.0,
     ) -> None:
         """Copy, check and freeze."""
         if not isinstance(model, LinearModel):
             raise InvalidArgumentError("model", f"{model!r} is not a LinearModel")
         horizon = as_count("horizon", horizon)
         lower, upper = _bounds(u_min, u_max, model.nu)
+        lowest, highest = _state_bounds(x_min, x_max, model.nx)
+        fall, rise = _rate_bounds(du_min, du_max, model.nu)
         radius = as_number("robot_radius", robot_radius)
         if radius < 0:
             raise BoundsError("robot_radius", f"{radius} m is negative")
@@ -100,6 +141,7 @@ class Problem:
             )
         max_obstacles = as_count("max_obstacles", max_obstacles, least=0)
         require_positive("slack_weight", slack_weight)
+        require_positive("state_slack_weight", state_slack_weight)
         subsamples = as_count("subsamples", subsamples)
         if margin is None:
             margin = Margin() if model.dim == 2 else Containment(0.95)
@@ -119,6 +161,11 @@ class Problem:
             "max_obstacles": max_obstacles,
             "subsamples": subsamples,
             "slack_weight": float(slack_weight),
+            "x_min": lowest,
+            "x_max": highest,
+            "du_min": fall,
+            "du_max": rise,
+            "state_slack_weight": float(state_slack_weight),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -140,6 +187,33 @@ class Problem:
         gaps = self.subsamples > 1
         return size_at(self.margin, self.model.dim, obstacles, self.horizon, count, gaps)
 
+    @cached_property
+    def bounded_states(self) -> IntArray:
+        """Indices (nb,) of the states with a finite bound."""
+        return np.flatnonzero(np.isfinite(self.x_min) | np.isfinite(self.x_max))
+
+    @cached_property
+    def limits_states(self) -> bool:
+        """Whether any state has a finite bound."""
+        return len(self.bounded_states) > 0
+
+    @cached_property
+    def limits_rates(self) -> bool:
+        """Whether any input's change per interval has a finite bound."""
+        return bool(np.isfinite(self.du_min).any() or np.isfinite(self.du_max).any())
+
+    def excess(self, states: FloatArray) -> FloatArray:
+        """Return by how much states (N+1, nx) are outside their bounds at stages 1 .. N (N, nx)."""
+        x = states[1:]
+        return np.maximum(0.0, np.maximum(x - self.x_max, self.x_min - x))
+
+    def penalty(self, slack: FloatArray, states: FloatArray) -> float:
+        """Return the price of the obstacles' slack [m] and of the excess of states (N+1, nx)."""
+        price = self.slack_weight * float(slack.sum())
+        if self.limits_states:
+            price += self.state_slack_weight * float(self.excess(states).sum())
+        return price
+
     def cost(
         self, states: FloatArray, inputs: FloatArray, s: FloatArray, x_ref: FloatArray
     ) -> float:
@@ -159,4 +233,25 @@ def _bounds(u_min: ArrayLike, u_max: ArrayLike, nu: int) -> tuple[FloatArray, Fl
     if (lower > upper).any():
         at = int(np.argmax(lower > upper))
         raise BoundsError("u_min", f"{lower[at]} exceeds u_max = {upper[at]} for input {at}")
+    return lower, upper
+
+
+def _state_bounds(
+    x_min: ArrayLike | None, x_max: ArrayLike | None, nx: int
+) -> tuple[FloatArray, FloatArray]:
+    lower, upper = as_bound("x_min", x_min, nx, -np.inf), as_bound("x_max", x_max, nx, np.inf)
+    if (lower > upper).any():
+        at = int(np.argmax(lower > upper))
+        raise BoundsError("x_min", f"{lower[at]} exceeds x_max = {upper[at]} for state {at}")
+    return lower, upper
+
+
+def _rate_bounds(
+    du_min: ArrayLike | None, du_max: ArrayLike | None, nu: int
+) -> tuple[FloatArray, FloatArray]:
+    lower, upper = as_bound("du_min", du_min, nu, -np.inf), as_bound("du_max", du_max, nu, np.inf)
+    for name, change, forbidden in (("du_min", lower, lower > 0), ("du_max", upper, upper < 0)):
+        if forbidden.any():
+            at = int(np.argmax(forbidden))
+            raise BoundsError(name, f"{change[at]} for input {at} does not allow holding it (0)")
     return lower, upper
