@@ -43,6 +43,10 @@ class BoundsError(InvalidArgumentError):
     """A lower bound exceeds its upper bound, or a size has the wrong sign."""
 
 
+class JacobianError(InvalidArgumentError):
+    """A model's derivatives are not those of the model."""
+
+
 class ConcurrentUseError(ScpMpcError):
     """One solver was called from two threads at once; each needs its own."""
 

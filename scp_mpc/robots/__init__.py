@@ -2,5 +2,14 @@
 
 from scp_mpc.robots.double_integrator import DoubleIntegrator
 from scp_mpc.robots.linear import LinearModel
+from scp_mpc.robots.model import Linearisation, Model, NonlinearModel
+from scp_mpc.robots.unicycle import Unicycle
 
-__all__ = ["DoubleIntegrator", "LinearModel"]
+__all__ = [
+    "DoubleIntegrator",
+    "LinearModel",
+    "Linearisation",
+    "Model",
+    "NonlinearModel",
+    "Unicycle",
+]

@@ -11,14 +11,16 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import fractional_matrix_power
 
-from scp_mpc.arrays import FloatArray, IntArray, as_array, as_number, frozen
-from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
+from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
+from scp_mpc.errors import InvalidArgumentError, ShapeError
+from scp_mpc.robots.model import Linearisation, Model, as_period
 
 
 @dataclass(frozen=True, eq=False)
-class LinearModel:
+class LinearModel(Model):
     """x_{i+1} = A x_i + B u_i, with the position read off the state.
 
     Args:
@@ -46,9 +48,7 @@ class LinearModel:
         B = as_array("B", self.B, (len(A), -1))
         if B.shape[1] == 0:
             raise ShapeError("B", f"shape {B.shape} has no input")
-        dt = as_number("dt", self.dt)
-        if dt <= 0:
-            raise BoundsError("dt", f"{dt} s is not positive")
+        dt = as_period(self.dt)
         position = np.array(self.position)
         whole = position.dtype.kind in "iu" and position.shape in ((2,), (3,))
         if not whole or len(set(position.tolist()) & set(range(len(A)))) < len(position):
@@ -72,14 +72,38 @@ class LinearModel:
         """Number of inputs."""
         return int(self.B.shape[1])
 
-    @property
-    def dim(self) -> int:
-        """Dimension of the workspace, 2 or 3."""
-        return len(self.position)
-
     def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state A x + B u."""
         return self.A @ x + self.B @ u
+
+    def advance(
+        self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
+    ) -> FloatArray:
+        """Return the states (..., nx) after a share of an interval with the input held."""
+        A, B = self._powers(fraction)
+        if A.ndim == 2:
+            return states @ A.T + inputs @ B.T
+        after: FloatArray = (A @ states[..., None] + B @ inputs[..., None])[..., 0]
+        return after
+
+    def linearise(
+        self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
+    ) -> Linearisation:
+        """Return `advance` with A and B, or what stands for them after a share of an interval."""
+        after = self.advance(states, inputs, fraction)
+        A, B = self._powers(fraction)
+        lead = after.shape[:-1]
+        return Linearisation(
+            after,
+            np.broadcast_to(A, (*lead, *A.shape[-2:])),
+            np.broadcast_to(B, (*lead, *B.shape[-2:])),
+        )
+
+    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
+        """Return zeros (..., nx+nu, nx+nu)."""
+        lead = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1], costates.shape[:-1])
+        n = self.nx + self.nu
+        return np.zeros((*lead, n, n))
 
     def between(self, fraction: float) -> tuple[FloatArray, FloatArray]:
         """Return C (d, nx) and D (d, nu): the position C x + D u within an interval.
@@ -91,16 +115,22 @@ class LinearModel:
         Args:
             fraction: Of the interval, between 0 and 1.
         """
-        nx, size = self.nx, self.nx + self.nu
-        whole = np.eye(size)
-        whole[:nx, :nx], whole[:nx, nx:] = self.A, self.B
-        part: Any = np.asarray(fractional_matrix_power(whole, fraction))
-        rest = np.asarray(fractional_matrix_power(whole, 1 - fraction))
-        away = np.abs(rest @ part - whole).max()
-        if np.iscomplexobj(part) or not away <= 1e-9 * np.abs(whole).max():
-            part = (1 - fraction) * np.eye(size) + fraction * whole
-        rows = np.ascontiguousarray(part[self.position].real)
-        return rows[:, :nx], rows[:, nx:]
+        rows = np.ascontiguousarray(self._power(fraction)[self.position])
+        return rows[:, : self.nx], rows[:, self.nx :]
+
+    def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return states (..., nx) there whose position moves by dt times the velocity if u = 0.
+
+        Entries that this leaves open are the smallest that will do.
+        """
+        drift = (self.A - np.eye(self.nx))[self.position]
+        others = np.setdiff1d(np.arange(self.nx), self.position)
+        here = np.asarray(position, dtype=np.float64)
+        wanted = self.dt * np.asarray(velocity) - here @ drift[:, self.position].T
+        states = np.zeros((*wanted.shape[:-1], self.nx))
+        states[..., self.position] = here
+        states[..., others] = wanted @ np.linalg.pinv(drift[:, others]).T
+        return states
 
     def brake(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,), bounds aside, after which the position comes to rest.
@@ -116,3 +146,24 @@ class LinearModel:
         drift = (self.A - np.eye(self.nx))[self.position]
         gain: FloatArray = np.linalg.pinv(drift @ self.B) @ drift @ self.A
         return gain
+
+    def _powers(self, fraction: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """A (..., nx, nx) and B (..., nx, nu) after shares (...) of an interval."""
+        if isinstance(fraction, float) and fraction == 1.0:
+            return self.A, self.B
+        values, place = np.unique(np.asarray(fraction, dtype=np.float64), return_inverse=True)
+        powers = np.stack([self._power(float(value)) for value in values])
+        rows = powers[place.reshape(np.shape(fraction)), : self.nx]
+        return rows[..., : self.nx], rows[..., self.nx :]
+
+    def _power(self, fraction: float) -> FloatArray:
+        nx, size = self.nx, self.nx + self.nu
+        whole = np.eye(size)
+        whole[:nx, :nx], whole[:nx, nx:] = self.A, self.B
+        part: Any = np.asarray(fractional_matrix_power(whole, fraction))
+        rest = np.asarray(fractional_matrix_power(whole, 1 - fraction))
+        away = np.abs(rest @ part - whole).max()
+        if np.iscomplexobj(part) or not away <= 1e-9 * np.abs(whole).max():
+            part = (1 - fraction) * np.eye(size) + fraction * whole
+        power: FloatArray = part.real
+        return power
