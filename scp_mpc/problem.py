@@ -38,8 +38,8 @@ from scp_mpc.arrays import (
     as_weight,
     frozen,
 )
-from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
+from scp_mpc.robots.model import Model
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
 from scp_mpc.safety.margin import Containment, Margin, Promise, size_at
 from scp_mpc.settings import require_positive
@@ -79,12 +79,14 @@ class Problem:
         du_max: Upper bounds likewise, never negative; entries may be infinity.
         state_slack_weight: Cost per unit and stage by which a state is outside its bounds. The
             penalty is exact as long as it exceeds the state bounds' multipliers.
+        discs: (n,) centres of the discs of `robot_radius` that cover a longer robot, from its
+            position along its heading [m]; for models that have one.
 
     Raises:
         InvalidArgumentError: Or one of its subclasses, with the argument and the number.
     """
 
-    model: LinearModel
+    model: Model
     horizon: int
     Q: FloatArray
     R: FloatArray
@@ -102,10 +104,11 @@ class Problem:
     du_min: FloatArray
     du_max: FloatArray
     state_slack_weight: float
+    discs: FloatArray
 
     def __init__(
         self,
-        model: LinearModel,
+        model: Model,
         *,
         horizon: int,
         Q: ArrayLike,
@@ -124,10 +127,11 @@ class Problem:
         du_min: ArrayLike | None = None,
         du_max: ArrayLike | None = None,
         state_slack_weight: float = 100.0,
+        discs: ArrayLike = (0.0,),
     ) -> None:
         """Copy, check and freeze."""
-        if not isinstance(model, LinearModel):
-            raise InvalidArgumentError("model", f"{model!r} is not a LinearModel")
+        if not isinstance(model, Model):
+            raise InvalidArgumentError("model", f"{model!r} is not a Model")
         horizon = as_count("horizon", horizon)
         lower, upper = _bounds(u_min, u_max, model.nu)
         lowest, highest = _state_bounds(x_min, x_max, model.nx)
@@ -166,6 +170,7 @@ class Problem:
             "du_min": fall,
             "du_max": rise,
             "state_slack_weight": float(state_slack_weight),
+            "discs": _discs(discs, model),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -184,7 +189,7 @@ class Problem:
 
     def size_for(self, obstacles: int, count: int) -> float:
         """The uniform size s for so many obstacles, with `count` points in each interval."""
-        gaps = self.subsamples > 1
+        gaps = len(self.discs) if self.subsamples > 1 else 0
         return size_at(self.margin, self.model.dim, obstacles, self.horizon, count, gaps)
 
     @cached_property
@@ -234,6 +239,15 @@ def _bounds(u_min: ArrayLike, u_max: ArrayLike, nu: int) -> tuple[FloatArray, Fl
         at = int(np.argmax(lower > upper))
         raise BoundsError("u_min", f"{lower[at]} exceeds u_max = {upper[at]} for input {at}")
     return lower, upper
+
+
+def _discs(discs: ArrayLike, model: Model) -> FloatArray:
+    offsets = as_array("discs", discs, (-1,))
+    if not len(offsets):
+        raise ShapeError("discs", "no disc covers the robot")
+    if model.heading is None and (len(offsets) > 1 or offsets[0] != 0):
+        raise InvalidArgumentError("discs", f"{type(model).__name__} has no heading to set them by")
+    return frozen(offsets)
 
 
 def _state_bounds(

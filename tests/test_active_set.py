@@ -19,7 +19,12 @@ def program(seed, n=12, K=6, far=False):
     inside = rng.normal(size=n) * (3.0 if far else 0.5)
     lower = np.minimum(F @ inside, 0.0) - rng.uniform(0, 0.3, n)
     upper = np.maximum(F @ inside, 0.0) + rng.uniform(0, 0.3, n)
-    return F, CondensedProgram(lower, upper, A, A @ inside - rng.uniform(0, 0.1, K))
+    return F, CondensedProgram(F, lower, upper, A, A @ inside - rng.uniform(0, 0.1, K))
+
+
+def yielding(p, cap):
+    """The same program with half-spaces that yield at a force."""
+    return replace(p, cap=np.concatenate([np.full(len(p.F), np.inf), np.full(len(p.b), cap)]))
 
 
 def clarabel(P, q, G, h):
@@ -61,7 +66,7 @@ def check(F, p, held, cap=np.inf):
 @given(seed=st.integers(0, 10_000), sizes=st.sampled_from([(12, 6), (40, 4), (6, 10)]))
 def test_agrees_with_another_solver(seed, sizes):
     F, p = program(seed, *sizes)
-    held = ActiveSetSolver(F).solve(p, np.zeros(sum(sizes), dtype=np.intp))
+    held = ActiveSetSolver(F.shape[1]).solve(p, np.zeros(sum(sizes), dtype=np.intp))
     assert held is not None
     check(F, p, held)
     # An interior point stops at a duality gap, whose root is the distance.
@@ -69,10 +74,45 @@ def test_agrees_with_another_solver(seed, sizes):
 
 
 @given(seed=st.integers(0, 10_000))
+def test_bounds_may_yield_while_half_spaces_do_not(seed):
+    """Some bounds are out of reach; what they pay is their distance times their cap."""
+    F, p = program(seed)
+    rng = np.random.default_rng(seed)
+    soft = np.arange(12) % 3 == 0
+    shift = np.where(soft, rng.choice([-4.0, 4.0], 12), 0.0)
+    cap = np.where(np.concatenate([soft, np.zeros(6, bool)]), 1.5, np.inf)
+    p = replace(p, lower=p.lower + shift, upper=p.upper + shift, cap=cap)
+    held = ActiveSetSolver(12).solve(p, np.zeros(18, dtype=np.intp))
+    assert held is not None
+    beyond = np.maximum(0, np.maximum(p.lower - F @ held.v, F @ held.v - p.upper))
+    assert (beyond[~soft] < 1e-8).all()
+    assert (p.A @ held.v >= p.b - 1e-8).all()
+    assert (np.abs(held.force[:12][beyond > 1e-7]) == 1.5).all()
+    assert (np.abs(held.force[:12][soft]) <= 1.5 * (1 + 1e-9)).all()
+    np.testing.assert_allclose(held.v, held.force @ np.vstack([F, p.A]), atol=1e-7)
+    assert p.penalty(held.v) == pytest.approx(1.5 * beyond[soft].sum())
+    z = clarabel_soft(F, p, soft)
+    np.testing.assert_allclose(held.v, z, atol=2e-3)
+
+
+def clarabel_soft(F, p, soft):
+    """The same with a slack for each soft bound."""
+    n, k = 12, int(soft.sum())
+    P = np.zeros((n + k, n + k))
+    P[:n, :n] = np.eye(n)
+    E = np.zeros((n, k))
+    E[soft] = np.eye(k)
+    none = np.zeros((len(p.b), k))
+    G = np.block([[F, -E], [-F, -E], [-p.A, none], [np.zeros((k, n)), -np.eye(k)]])
+    h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(k)])
+    return clarabel(P, np.concatenate([np.zeros(n), np.full(k, 1.5)]), G, h)[:n]
+
+
+@given(seed=st.integers(0, 10_000))
 def test_yields_like_an_exact_l1_penalty(seed):
     F, p = program(seed)
-    tight = CondensedProgram(p.lower, p.upper, p.A, p.b + 2.0)
-    held = ActiveSetSolver(F).solve(tight, np.zeros(18, dtype=np.intp), cap=3.0)
+    tight = yielding(replace(p, b=p.b + 2.0), 3.0)
+    held = ActiveSetSolver(F.shape[1]).solve(tight, np.zeros(18, dtype=np.intp))
     assert held is not None
     check(F, tight, held, cap=3.0)
     np.testing.assert_allclose(held.v, oracle(F, tight, cap=3.0), atol=1e-3)
@@ -81,7 +121,7 @@ def test_yields_like_an_exact_l1_penalty(seed):
 def test_any_guess_leads_to_the_same_point():
     rng = np.random.default_rng(0)
     F, p = program(3)
-    solver = ActiveSetSolver(F)
+    solver = ActiveSetSolver(F.shape[1])
     cold = solver.solve(p, np.zeros(18, dtype=np.intp))
     for _ in range(20):
         guess = rng.integers(-1, 2, 18)
@@ -94,7 +134,7 @@ def test_any_guess_leads_to_the_same_point():
 
 def test_a_glimpse_is_the_same_point_without_its_forces():
     F, p = program(5)
-    solver = ActiveSetSolver(F)
+    solver = ActiveSetSolver(F.shape[1])
     held = solver.solve(p, np.zeros(18, dtype=np.intp))
     v, pushing = solver.glimpse(p, np.zeros(12, dtype=np.intp))
     np.testing.assert_allclose(v, held.v, atol=1e-7)
@@ -103,21 +143,19 @@ def test_a_glimpse_is_the_same_point_without_its_forces():
 
 def test_what_cannot_be_met_has_no_solution_unless_it_yields():
     F, p = program(1, far=True)
-    opposed = CondensedProgram(
-        p.lower, p.upper, np.vstack([p.A[:1], -p.A[:1]]), np.array([0.1, 0.1])
-    )
-    solver, nothing = ActiveSetSolver(F), np.zeros(14, dtype=np.intp)
+    opposed = replace(p, A=np.vstack([p.A[:1], -p.A[:1]]), b=np.array([0.1, 0.1]))
+    solver, nothing = ActiveSetSolver(F.shape[1]), np.zeros(14, dtype=np.intp)
     assert solver.solve(opposed, nothing) is None
     assert solver.glimpse(opposed, nothing[:12]) is None
-    held = solver.solve(opposed, nothing, cap=50.0)
+    held = solver.solve(yielding(opposed, 50.0), nothing)
     check(F, opposed, held, cap=50.0)
     assert held.capped.sum() >= 1
 
 
 def test_the_same_row_twice_does_no_harm():
     F, p = program(2)
-    twice = CondensedProgram(p.lower, p.upper, np.vstack([p.A, p.A]), np.tile(p.b, 2))
-    solver = ActiveSetSolver(F)
+    twice = replace(p, A=np.vstack([p.A, p.A]), b=np.tile(p.b, 2))
+    solver = ActiveSetSolver(F.shape[1])
     once = solver.solve(p, np.zeros(18, dtype=np.intp))
     held = solver.solve(twice, np.zeros(24, dtype=np.intp))
     np.testing.assert_allclose(held.v, once.v, atol=1e-7)
@@ -128,14 +166,14 @@ def test_bounds_enter_as_they_matter_and_all_are_kept():
     """The half-spaces push against bounds that neither the guess nor the origin touches."""
     for n in (30, 150):
         F, p = program(11, n=n, K=8, far=True)
-        held = ActiveSetSolver(F).solve(p, np.zeros(n + 8, dtype=np.intp))
+        held = ActiveSetSolver(F.shape[1]).solve(p, np.zeros(n + 8, dtype=np.intp))
         assert (held.active[:n] != 0).any()
         check(F, p, held)
 
 
 def test_consistent_sees_wrong_forces_and_broken_constraints():
     F, p = program(4)
-    solver = ActiveSetSolver(F)
+    solver = ActiveSetSolver(F.shape[1])
     held = solver.solve(p, np.zeros(18, dtype=np.intp))
     assert solver.consistent(p, held, 1e-9)
     assert not solver.consistent(p, replace(held, force=-held.force), 1e-9)
@@ -147,7 +185,7 @@ def test_consistent_sees_wrong_forces_and_broken_constraints():
 @pytest.mark.parametrize("cap", [np.inf, 1e3])
 def test_nothing_to_do(cap):
     F, p = program(0)
-    free = CondensedProgram(p.lower - 1, p.upper + 1, np.zeros((0, 12)), np.zeros(0))
-    held = ActiveSetSolver(F).solve(free, np.zeros(12, dtype=np.intp), cap)
+    free = CondensedProgram(F, p.lower - 1, p.upper + 1, np.zeros((0, 12)), np.zeros(0))
+    held = ActiveSetSolver(12).solve(yielding(free, cap), np.zeros(12, dtype=np.intp))
     assert not held.v.any()
     assert not held.force.any()

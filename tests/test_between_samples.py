@@ -18,7 +18,7 @@ from scp_mpc import (
     StageRisk,
     Status,
 )
-from scp_mpc.solver.sampling import Sampling
+from scp_mpc.solver.sampling import LinearSampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.sweep import Sweep, swept
 
@@ -131,7 +131,7 @@ def test_a_discrete_model_is_interpolated_between_its_samples():
 def test_forces_are_the_adjoint_of_positions():
     rng, model = np.random.default_rng(0), DoubleIntegrator(DT, 3)
     for count in (1, 3):
-        sampling = Sampling(model, 5, count)
+        sampling = LinearSampling(model, 5, count)
         e, u = rng.normal(size=(5, 6)), rng.normal(size=(5, 3))
         phi = rng.normal(size=(sampling.points, 3))
         on_e, on_u = sampling.pull(phi.ravel())
@@ -156,7 +156,7 @@ def test_interpolated_covariances_err_on_the_safe_side(seed):
     rng = np.random.default_rng(seed)
     G = rng.normal(size=(4, 4))
     joint = G @ G.T
-    sampling = Sampling(DoubleIntegrator(DT), 1, 4)
+    sampling = LinearSampling(DoubleIntegrator(DT), 1, 4)
     ours = sampling.interpolated(np.array([[joint[:2, :2], joint[2:, 2:]]]))[0]
     for k in range(5):
         mix = np.hstack([(1 - k / 4) * np.eye(2), k / 4 * np.eye(2)])

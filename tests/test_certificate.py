@@ -12,8 +12,9 @@ from instances import KINDS, S_REF, instance, obstacle, problem, straight_refere
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status, Trajectory
 from scp_mpc.solver import condensed_scp
-from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.conflicts import Conflicts
+from scp_mpc.solver.layout import Layout
+from scp_mpc.solver.sampling import Sampling
 from scp_mpc.solver.step_data import StepData
 
 
@@ -180,17 +181,17 @@ def test_pairs_are_linearised_like_the_whole_table(inflation):
     case, ref = problem(8, inflation, max_obstacles=3), straight_reference(8)
     x0 = ref[0] + [0.0, 0.0, 0.3, 0.0]
     obstacles = [obstacle(8, (1.0, 0.2)), obstacle(8, (2.0, -0.4), (-0.5, 0.1))]
-    condensed = Condensed(case)
-    condensed.start(x0, ref)
-    y = np.concatenate([rng.normal(size=16), np.zeros(16), [S_REF, 2.0, 1.5]])
+    layout = Layout(case, Sampling.of(case, 1))
+    y = np.zeros(layout.size)
+    y[layout.p], y[layout.s] = rng.normal(size=16), [S_REF, 2.0, 1.5]
     states = ref.copy()
-    states[1:, [0, 2]] += y[condensed.p].reshape(8, 2)
+    states[1:, [0, 2]] += y[layout.p].reshape(8, 2)
     states[3, [0, 2]] = obstacles[0].means[3]
     states[1, [0, 2]] = obstacles[1].means[1]
-    y[condensed.p] = (states - ref)[1:, [0, 2]].ravel()
+    y[layout.p] = (states - ref)[1:, [0, 2]].ravel()
     step = StepData.read(case, x0, ref, obstacles)
-    whole = step.half_spaces(states, y[condensed.s])
-    pairs = Conflicts(step, condensed, np.ones((2, 8), dtype=bool))
+    whole = step.half_spaces(states, y[layout.s])
+    pairs = Conflicts(step, layout, np.ones((2, 8), dtype=bool))
     tangent = pairs.tangent(y)
     at = pairs.obstacle, pairs.point
     np.testing.assert_allclose(tangent.g, whole.value[at], atol=1e-12)
@@ -198,7 +199,7 @@ def test_pairs_are_linearised_like_the_whole_table(inflation):
     np.testing.assert_allclose(tangent.a[:, 2], whole.slope[at], atol=1e-9)
     paths = np.stack([states[:, [0, 2]]] * 2)
     paths[:, 0] = x0[[0, 2]]
-    a, b = pairs.about(paths, y[condensed.s])
+    a, b = pairs.about(paths, y[layout.s])
     np.testing.assert_allclose(a[1], tangent.a, atol=1e-12)
     residual = (a[1] * y[pairs.at]).sum(axis=1) - b[1]
     np.testing.assert_allclose(residual, whole.value[at], atol=1e-9)

@@ -6,6 +6,9 @@ from instances import KINDS, S_REF, instance, obstacle, problem, straight_refere
 
 from scp_mpc import SCP, DoubleIntegrator, LinearModel, QPSettings, Settings, Status, Trajectory
 from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.layout import Layout
+from scp_mpc.solver.sampling import LinearSampling
+from scp_mpc.solver.step_data import StepData
 from scp_mpc.trajectory import rollout
 
 SPARSE = Settings(sides=False, condense=False, qp=QPSettings(accuracy=1e-9), max_iterations=300)
@@ -34,21 +37,26 @@ def spaces():
 def test_every_v_obeys_the_dynamics_and_costs_half_its_square_more(case):
     rng = np.random.default_rng(1)
     model, N, M = case.model, case.horizon, case.max_obstacles
-    c = Condensed(case)
+    c, y = Condensed(case), Layout(case, LinearSampling(model, N, 1))
     x0, ref = rng.normal(size=model.nx), rng.normal(size=(N + 1, model.nx))
-    free = c.start(x0, ref)
+    c.begin(StepData.read(case, x0, ref, []))
+    chart = c.chart()
 
-    def cost(y):
-        path = rollout(model.step, x0, y[c.u].reshape(N, model.nu))
-        p = y[c.p].reshape(N, model.dim) + ref[1:, model.position]
+    def cost(v):
+        outputs = chart.y(v)
+        path = rollout(model.step, x0, outputs[y.u].reshape(N, model.nu))
+        p = outputs[y.p].reshape(N, model.dim) + ref[1:, model.position]
         np.testing.assert_allclose(path.states[1:, model.position], p, atol=1e-9)
-        np.testing.assert_allclose(c.deviations(path.inputs), path.states[1:] - ref[1:], atol=1e-9)
-        return case.cost(path.states, path.inputs, y[c.s], ref)
+        e = c.rolled(path.inputs).deviations
+        np.testing.assert_allclose(e, path.states[1:] - ref[1:], atol=1e-9)
+        return case.cost(path.states, path.inputs, outputs[y.s], ref)
 
-    assert c.moving_sizes == (M if case.margin.lower < case.margin.reference else 0)
+    assert y.moving == (M if case.margin.lower < case.margin.reference else 0)
+    free = cost(np.zeros(y.variables))
+    assert chart.least == pytest.approx(free, rel=1e-9)
     for _ in range(5):
-        v = rng.normal(size=c.response.shape[1])
-        assert cost(free + c.response @ v) - cost(free) == pytest.approx(v @ v / 2, rel=1e-7)
+        v = rng.normal(size=y.variables)
+        assert cost(v) - free == pytest.approx(v @ v / 2, rel=1e-7)
 
 
 def test_costates_are_the_adjoint_of_the_rollout():
@@ -56,13 +64,15 @@ def test_costates_are_the_adjoint_of_the_rollout():
     rng = np.random.default_rng(2)
     case = problem(6)
     c = Condensed(case)
-    c.start(rng.normal(size=4), rng.normal(size=(7, 4)))
+    c.begin(StepData.read(case, rng.normal(size=4), rng.normal(size=(7, 4)), []))
     w, u = rng.normal(size=(6, 4)), rng.normal(size=(6, 2))
-    gradient = c.costates(w) @ case.model.B
+    motion = c.rolled(u).motion
+    gradient = motion.thrust(motion.costates(w))
     for i, k in np.ndindex(6, 2):
         step = np.zeros((6, 2))
         step[i, k] = 1.0
-        change = np.vdot(w, c.deviations(u + step) - c.deviations(u - step)) / 2
+        e = [c.rolled(u + sign * step).deviations for sign in (1, -1)]
+        change = np.vdot(w, e[0] - e[1]) / 2
         assert gradient[i, k] == pytest.approx(change, abs=1e-9)
 
 

@@ -30,8 +30,8 @@ def bent(scale, seed=0, n=8, k=2, q=3):
     """A program's solution, and bends that make the convex steps shrink or grow."""
     rng = np.random.default_rng(seed)
     A, L = rng.normal(size=(k, n)), scale * rng.normal(size=(q, n)) / np.sqrt(n)
-    p = CondensedProgram(np.full(n, -1e3), np.full(n, 1e3), A, np.ones(k))
-    held = ActiveSetSolver(np.eye(n)).solve(p, np.concatenate([np.zeros(n, int), -np.ones(k, int)]))
+    p = CondensedProgram(np.eye(n), np.full(n, -1e3), np.full(n, 1e3), A, np.ones(k))
+    held = ActiveSetSolver(n).solve(p, np.concatenate([np.zeros(n, int), -np.ones(k, int)]))
     return held, L, rng.normal(size=n), np.eye(n) - np.linalg.pinv(held.rows) @ held.rows
 
 
@@ -180,8 +180,8 @@ def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
 
     def astray(self, *given):
         leapt.append(given)
-        y = self._step.y(given[2].v)
-        y[self._step.condensed.p] += 1.0
+        y = self._step.chart.y(given[2].v)
+        y[self._step.layout.p] += 1.0
         return y
 
     monkeypatch.setattr(newton.Newton, "_ahead", astray)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.comparison.nlp import linear_model
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.margin import JointRisk, StageRisk
@@ -72,7 +73,8 @@ def audit(
 
 
 def _states(problem: Problem, x0: FloatArray, U: FloatArray) -> FloatArray:
-    A, B = problem.model.A, problem.model.B
+    model = linear_model(problem)
+    A, B = model.A, model.B
     states = [x0]
     for u in U:
         states.append(A @ states[-1] + B @ u)

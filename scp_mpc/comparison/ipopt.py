@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns
+from scp_mpc.comparison.nlp import Unknowns, linear_model
 from scp_mpc.comparison.peer_plan import PeerMissingError, PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -150,7 +150,7 @@ def parameters(step: StepData) -> FloatArray:
 
 def _program(casadi: Any, problem: Problem, unknowns: Unknowns, lifted: bool) -> dict[str, Any]:
     """The symbolic program: dynamics rows stage by stage, then obstacle rows slot by slot."""
-    model, N, M = problem.model, problem.horizon, problem.max_obstacles
+    model, N, M = linear_model(problem), problem.horizon, problem.max_obstacles
     nx, nu, d = model.nx, model.nu, model.dim
     z = casadi.SX.sym("z", unknowns.size)
     theta = casadi.SX.sym("theta", N, M if lifted else 0)

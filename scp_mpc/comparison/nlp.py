@@ -16,7 +16,22 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
 from scp_mpc.solver.iterate import Iterate
+
+
+def linear_model(problem: Problem) -> LinearModel:
+    """The problem's model.
+
+    Raises:
+        InvalidArgumentError: It is not linear.
+    """
+    model = problem.model
+    if not isinstance(model, LinearModel):
+        raise InvalidArgumentError(
+            "problem.model", f"{type(model).__name__}, but peers know linear models only"
+        )
+    return model
 
 
 class Unknowns:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import Bounds, minimize
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns
+from scp_mpc.comparison.nlp import Unknowns, linear_model
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -85,7 +85,7 @@ class Slsqp:
     def _defects(self, z: FloatArray, step: StepData) -> FloatArray:
         """x_{i+1} - A x_i - B u_i, (N nx,)."""
         X, U, _ = self._unknowns.unpack(z, step.x0)
-        model = self.problem.model
+        model = linear_model(self.problem)
         return (X[1:] - X[:-1] @ model.A.T - U @ model.B.T).ravel()
 
     def _outside(self, z: FloatArray, step: StepData) -> FloatArray:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.ipopt import import_casadi, parameters
+from scp_mpc.comparison.nlp import linear_model
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -133,7 +134,7 @@ class Staged:
 
 def _program(casadi: Any, problem: Problem) -> tuple[dict[str, Any], list[bool]]:
     """The program and which rows are equations: per stage dynamics first, then the others."""
-    model, N, M = problem.model, problem.horizon, problem.max_obstacles
+    model, N, M = linear_model(problem), problem.horizon, problem.max_obstacles
     nx, nu, d = model.nx, model.nu, model.dim
     x0, x_ref = casadi.SX.sym("x0", nx), casadi.SX.sym("x_ref", nx, N)
     mu, R = casadi.SX.sym("mu", d, M * N), casadi.SX.sym("R", d, M * N * d)

@@ -129,7 +129,7 @@ Promise = Margin | Containment | StageRisk | JointRisk
 
 
 def size_at(
-    promise: Promise, dim: int, obstacles: int, stages: int, count: int, gaps: bool
+    promise: Promise, dim: int, obstacles: int, stages: int, count: int, gaps: int
 ) -> float:
     """The uniform size s of a promise.
 
@@ -139,7 +139,8 @@ def size_at(
         obstacles: J.
         stages: N.
         count: K.
-        gaps: Whether the promise covers what happens between two points.
+        gaps: Points at the beginning of an interval, if the promise covers what happens between
+            two points; else 0.
     """
     if isinstance(promise, Margin):
         return promise.reference

@@ -28,12 +28,13 @@ import numpy as np
 from scp_mpc.arrays import BoolArray, FloatArray, as_array, as_number
 from scp_mpc.errors import BoundsError, ShapeError
 from scp_mpc.robots.linear import LinearModel
+from scp_mpc.robots.model import Model
 
 FINE = 32  # pieces of an interval; at 3 m/s^2 and 0.2 s they are within 0.02 mm of the curve
 _CHUNK = 8192  # paths at once: temporaries stay within the processor's caches
 
 
-def robot_path(model: LinearModel, states: FloatArray, inputs: FloatArray) -> FloatArray:
+def robot_path(model: Model, states: FloatArray, inputs: FloatArray) -> FloatArray:
     """Positions (N, FINE+1, d) of the robot at equal fractions of each interval [m].
 
     Args:
@@ -42,7 +43,11 @@ def robot_path(model: LinearModel, states: FloatArray, inputs: FloatArray) -> Fl
         inputs: (N, nu), each held over its interval.
     """
     path = [states[:-1, model.position]]
-    path += [states[:-1] @ C.T + inputs @ D.T for C, D in _pieces(model)]
+    if isinstance(model, LinearModel):
+        path += [states[:-1] @ C.T + inputs @ D.T for C, D in _pieces(model)]
+    else:
+        shares = np.arange(1, FINE)[:, None] / FINE
+        path += [*model.advance(states[None, :-1], inputs[None], shares)[..., model.position]]
     path.append(states[1:, model.position])
     return np.stack(path, axis=1)
 

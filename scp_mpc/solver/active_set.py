@@ -10,7 +10,7 @@ that set.
 
 Notation:
     v       (nv,)       inputs and sizes in coordinates that make the Hessian the identity
-    F       (nf, nv)    responses of the bounded entries, constant
+    F       (nf, nv)    responses of the bounded entries
     A       (K, nv)     responses of the half-spaces, new in every program
 """
 
@@ -41,16 +41,31 @@ class CondensedProgram:
     """The values of one program.
 
     Attributes:
+        F: (nf, nv) responses of the bounded entries, in C's order.
         lower: (nf,) bounds of F v.
         upper: (nf,) likewise.
         A: (K, nv) half-spaces.
         b: (K,) their right-hand sides.
+        cap: (nf + K,) largest force on each constraint: finite where it may yield. None where
+            none may.
     """
 
+    F: FloatArray
     lower: FloatArray
     upper: FloatArray
     A: FloatArray
     b: FloatArray
+    cap: FloatArray | None = None
+
+    def penalty(self, v: FloatArray) -> float:
+        """What v (nv,) pays for constraints that yield."""
+        if self.cap is None:
+            return 0.0
+        bounded = self.F @ v
+        beyond = np.maximum(self.lower - bounded, bounded - self.upper)
+        short = np.concatenate([beyond, self.b - self.A @ v])
+        soft = np.isfinite(self.cap)
+        return float(self.cap[soft] @ np.maximum(short[soft], 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +76,7 @@ class Held:
         v: (nv,) point.
         force: (nf + K,) positive at lower bounds and half-spaces.
         active: (nf + K,) -1 at a lower bound or half-space, 1 at an upper bound, 0 elsewhere.
-        capped: (nf + K,) half-spaces that yield at the largest force.
+        capped: (nf + K,) constraints that yield at the largest force.
         rows: (k, nv) responses of the active constraints that hold with equality.
         indices: (k,) which they are.
         factor: (k, k) upper Cholesky factor of rows rows'.
@@ -80,88 +95,86 @@ class ActiveSetSolver:
     """Solves condensed programs.
 
     Args:
-        F: (nf, nv) responses of the bounded entries.
+        variables: nv.
     """
 
-    def __init__(self, F: FloatArray) -> None:
+    def __init__(self, variables: int) -> None:
         """Prepare what all programs share."""
-        self._F = np.ascontiguousarray(F)
-        self._identity, self._zero = np.eye(F.shape[1]), np.zeros(F.shape[1])
+        self._identity, self._zero = np.eye(variables), np.zeros(variables)
         self._until = np.inf
 
     def limit(self, until: float) -> None:
         """Give up programs that are not solved at this time of `perf_counter`."""
         self._until = until
 
-    def solve(
-        self, program: CondensedProgram, active: IntArray, cap: float = np.inf
-    ) -> Held | None:
+    def solve(self, program: CondensedProgram, active: IntArray) -> Held | None:
         """Solve, beginning at an active set; None if there is no point, or no solution came.
 
         Args:
             program: The program.
             active: (nf + K,) guess of the active set.
-            cap: Largest force on a half-space; finite where they may yield.
         """
-        end = self._search(program, active, cap)
+        end = self._search(program, active)
         if end is None:
             return None
         force = end[1]
-        capped = np.zeros(len(force), dtype=np.bool_)
-        if np.isfinite(cap):
-            capped[len(self._F) :] = force[len(self._F) :] >= cap
-        return self._settled(program, np.sign(-force).astype(np.intp), capped, cap)
+        if program.cap is None:
+            capped = np.zeros(len(force), dtype=np.bool_)
+        else:
+            capped = np.abs(force) >= program.cap
+        return self._settled(program, np.sign(-force).astype(np.intp), capped)
 
     def glimpse(
-        self, program: CondensedProgram, active: IntArray, cap: float = np.inf
+        self, program: CondensedProgram, active: IntArray
     ) -> tuple[FloatArray, BoolArray] | None:
         """Return only v (nv,) and which half-spaces (K,) push, or None.
 
         Args:
             program: The program.
             active: (nf,) guess of the active bounds.
-            cap: As for `solve`.
         """
         guess = np.concatenate([active, np.zeros(len(program.b), dtype=np.intp)])
-        end = self._search(program, guess, cap)
-        return None if end is None else (end[0], end[1][len(self._F) :] > 0)
+        end = self._search(program, guess)
+        return None if end is None else (end[0], end[1][len(program.F) :] > 0)
 
     def consistent(self, program: CondensedProgram, held: Held, tolerance: float) -> bool:
         """Whether all forces push the right way and all constraints that do not yield hold."""
         if (held.force * held.active > 0).any():
             return False
-        bounded, gap = self._F @ held.v, program.A @ held.v - program.b
-        return not (
-            (bounded < program.lower - tolerance).any()
-            or (bounded > program.upper + tolerance).any()
-            or ((gap < -tolerance) & ~held.capped[len(self._F) :]).any()
-        )
+        nf = len(program.F)
+        bounded, gap = program.F @ held.v, program.A @ held.v - program.b
+        broken = (bounded < program.lower - tolerance) | (bounded > program.upper + tolerance)
+        if program.cap is not None:
+            broken &= ~held.capped[:nf]
+        return not (broken.any() or ((gap < -tolerance) & ~held.capped[nf:]).any())
 
     def _search(
-        self, program: CondensedProgram, active: IntArray, cap: float
+        self, program: CondensedProgram, active: IntArray
     ) -> tuple[FloatArray, FloatArray] | None:
         """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that matter."""
-        nf, K = len(self._F), len(program.b)
-        lower, upper = program.lower, program.upper
+        F, nf, K = program.F, len(program.F), len(program.b)
+        lower, upper, cap = program.lower, program.upper, program.cap
+        soft = None if cap is None else np.where(np.isfinite(cap), _SOFT, 0).astype(np.intc)
         within = (active[:nf] != 0) | (lower > 0) | (upper < 0) | (nf <= _SMALL)
         sense = np.where(active < 0, _LOWER, active).astype(np.intc)
-        if np.isfinite(cap):
-            sense[nf:] |= _SOFT
         for attempt in count():
             if attempt == _ATTEMPTS:
                 within[:] = True
             which = within.nonzero()[0]
             if not len(which) + K:
                 return self._zero, np.zeros(nf)
-            rows = np.concatenate([self._F[which], program.A])
+            rows = np.concatenate([F[which], program.A])
             least = np.concatenate([lower[which], program.b])
             most = np.concatenate([upper[which], np.full(K, _INFINITY)])
-            flags = np.concatenate([sense[which], sense[nf:]])
-            end = self._run(rows, least, most, flags, cap)
+            flags, most_force = np.concatenate([sense[which], sense[nf:]]), None
+            if cap is not None and soft is not None:
+                most_force = np.concatenate([cap[which], cap[nf:]])
+                flags |= np.concatenate([soft[which], soft[nf:]])
+            end = self._run(rows, least, most, flags, most_force)
             if end is None:
                 return None
             v, given = end
-            bounded = self._F @ v
+            bounded = F @ v
             broken = (bounded < lower - _ACCURACY) | (bounded > upper + _ACCURACY)
             broken &= ~within
             if not broken.any():
@@ -170,12 +183,15 @@ class ActiveSetSolver:
                 return v, force
             within |= broken
             sense[which], sense[nf:] = _signs(given[: len(which)]), _signs(given[len(which) :])
-            if np.isfinite(cap):
-                sense[nf:] |= _SOFT
         raise AssertionError  # unreachable: with all bounds none is broken
 
     def _run(
-        self, rows: FloatArray, least: FloatArray, most: FloatArray, sense: IntArray, cap: float
+        self,
+        rows: FloatArray,
+        least: FloatArray,
+        most: FloatArray,
+        sense: IntArray,
+        cap: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray] | None:
         """Let DAQP solve with these rows; return v and their forces."""
         wide = rows
@@ -188,11 +204,12 @@ class ActiveSetSolver:
         seconds = 0.0  # no limit
         if self._until < np.inf:
             seconds = max(self._until - perf_counter(), _LEAST_TIME)
-        if np.isfinite(cap):
+        if cap is not None:
             model = daqp.Model()
             model.setup(identity, zero, rows, most, least, sense)
             model.settings = {"primal_tol": _ACCURACY, "time_limit": seconds}
-            weight, softness = np.full(len(rows), cap), np.full(len(rows), _YIELDING)
+            weight = np.where(np.isfinite(cap), cap, 0.0)
+            softness = np.full(len(rows), _YIELDING)
             model.soft_weights(softness, softness, weight, weight)
             v, _, flag, info = model.solve()
         else:
@@ -205,18 +222,18 @@ class ActiveSetSolver:
         return (v if rows is wide else force @ wide), force
 
     def _settled(
-        self, program: CondensedProgram, active: IntArray, capped: BoolArray, cap: float
+        self, program: CondensedProgram, active: IntArray, capped: BoolArray
     ) -> Held | None:
         """Solve for exactly this active set; None if its rows depend on each other."""
-        nf = len(self._F)
+        nf = len(program.F)
         v, force = np.zeros(len(self._zero)), np.zeros(len(active))
         indices = active.nonzero()[0]
-        if capped.any():
-            force[capped] = cap
-            v = cap * program.A[capped[nf:]].sum(axis=0)
+        if program.cap is not None and capped.any():
+            force[capped] = -active[capped] * program.cap[capped]
+            v = force[:nf] @ program.F + force[nf:] @ program.A
             indices = (active * ~capped).nonzero()[0]
         bounds, spaces = indices[indices < nf], indices[indices >= nf] - nf
-        rows, factor = np.concatenate([self._F[bounds], program.A[spaces]]), np.zeros((0, 0))
+        rows, factor = np.concatenate([program.F[bounds], program.A[spaces]]), np.zeros((0, 0))
         if len(indices):
             at = np.where(active[bounds] < 0, program.lower[bounds], program.upper[bounds])
             wanted = np.concatenate([at, program.b[spaces]]) - rows @ v

@@ -1,18 +1,18 @@
 """The KKT residual of the original problem, computed from its own data at a condensed solution.
 
-Inputs are rolled out through the dynamics, gradients are taken at the rolled-out positions, and
+Inputs are rolled out through the dynamics, derivatives are taken along the rolled-out plan, and
 multipliers nu of the dynamics follow backwards from stationarity in the states,
 
-    D' nu = phi_e - 2 Q e,     then in the inputs     2 R u - B' nu - phi_u - beta = 0
+    D' nu = phi_e - 2 Q e,     then in the inputs     2 R u - B' nu - phi_u = 0
 
-has to hold (phi_u: forces on points between two samples), and for sizes that move
-2 w (s - s_ref) - phi_s - beta_s = 0.
+has to hold, and for sizes that move 2 w (s - s_ref) - phi_s = 0.
 
 Notation:
     e, u, s     deviations, inputs and sizes
     lambda      (K,)    forces on the pairs of obstacle and stage, non-negative
-    phi         (ny,)   sum_k lambda_k grad g_k: forces on positions and sizes
     beta        (nf,)   forces of the bounds, positive at lower ones
+    phi         (ny,)   forces of all constraints: sum_k lambda_k grad g_k on positions and sizes
+                        (positions between samples pass theirs on to states and inputs), and beta
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,9 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
-from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.chart import Rolled
 from scp_mpc.solver.conflicts import Conflicts, Tangent
+from scp_mpc.solver.layout import Layout
 from scp_mpc.solver.program import KKTResiduals
 
 
@@ -49,21 +50,23 @@ class Point:
 
     Attributes:
         y: (ny,) outputs, their positions rolled out from the inputs.
-        deviations: (N, nx) e.
+        rolled: The plan that its inputs lead to.
         costates: (N, nx) nu.
         reaction: (nf,) beta.
         pushed: The obstacles' part; None if none is near.
         cost: Objective without slack.
         residuals: KKT residuals of the original problem.
+        excess: (N nb,) how far the bounded states exceed their bounds.
     """
 
     y: FloatArray
-    deviations: FloatArray
+    rolled: Rolled
     costates: FloatArray
     reaction: FloatArray
     pushed: Pushed | None
     cost: float
     residuals: KKTResiduals
+    excess: FloatArray
 
     @property
     def tangent(self) -> Tangent:
@@ -82,64 +85,87 @@ class Certificate:
 
     Args:
         problem: Whose KKT conditions are checked.
-        condensed: Rolls inputs out.
+        layout: What y holds.
     """
 
-    def __init__(self, problem: Problem, condensed: Condensed) -> None:
+    def __init__(self, problem: Problem, layout: Layout) -> None:
         """Remember the problem."""
-        self._problem, self._condensed = problem, condensed
+        self._problem, self._layout = problem, layout
 
-    def rolled_out(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Clip the inputs in y to their bounds; return y and e with the positions they lead to."""
-        model, c = self._problem.model, self._condensed
-        y = np.minimum(np.maximum(y, c.lower), c.upper)
-        e = c.deviations(y[c.u].reshape(-1, model.nu))
-        y[c.p] = c.sampling.deviations(e, y[c.u].reshape(-1, model.nu)).ravel()
-        return y, e
+    def costates(
+        self, rolled: Rolled, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Multipliers nu (N, nx) at deviations e, forces on u (N, nu) and on s (M,)."""
+        problem, c = self._problem, self._layout
+        pull = -2 * (e @ problem.Q)
+        pull[-1] = -2 * (e[-1] @ problem.Qf)
+        on_u, on_s = np.zeros(c.shape), np.zeros(problem.max_obstacles)
+        if pushed is not None:
+            weights = (pushed.force[:, None] * pushed.tangent.a).ravel()
+            at = pushed.conflicts.at.ravel()
+            phi = np.bincount(at, weights=weights, minlength=c.size).astype(np.float64)
+            on_e, between = rolled.motion.pull(phi[c.p])
+            pull += on_e
+            on_s = phi[c.s]
+            if between is not None:
+                on_u = between
+        if reaction.any():
+            bound_e, bound_u = c.pushed(reaction)
+            on_u = on_u + bound_u
+            if bound_e is not None:
+                pull += bound_e
+            if c.moving:
+                on_s = on_s + reaction[: c.moving]
+        return rolled.motion.costates(pull), on_u, on_s
 
     def certify(
-        self, y: FloatArray, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
+        self,
+        y: FloatArray,
+        rolled: Rolled,
+        reaction: FloatArray,
+        pushed: Pushed | None,
+        bounds: tuple[FloatArray, FloatArray],
     ) -> Point:
         """Return the point with its residuals.
 
         Args:
             y: (ny,) outputs.
-            e: (N, nx) deviations that belong to its inputs.
+            rolled: The plan that belongs to its inputs.
             reaction: (nf,) forces of the bounds.
             pushed: The obstacles' part.
+            bounds: Of y in this step.
         """
-        problem, c = self._problem, self._condensed
-        model, w = problem.model, problem.size.weight
-        u, away = y[c.u].reshape(-1, model.nu), y[c.s] - problem.size.reference
+        problem, c = self._problem, self._layout
+        u, e, w = rolled.inputs, rolled.deviations, problem.size.weight
+        away = y[c.s] - problem.size.reference
         track, effort = e @ problem.Q, u @ problem.R
         track[-1] = e[-1] @ problem.Qf
         cost = float(np.vdot(track, e) + np.vdot(effort, u) + w * (away @ away))
         scale = max(1.0, 2 * float(np.abs(track).max()), 2 * float(np.abs(effort).max()))
-        pull = -2 * track
-        gradient = np.empty(len(reaction))
+        nu, on_u, on_s = self.costates(rolled, e, reaction, pushed)
+        stationarity = float(np.abs(2 * effort - rolled.motion.thrust(nu) - on_u).max())
+        if c.moving:
+            stationarity = max(stationarity, float(np.abs(2 * w * away - on_s).max()))
         feasibility = product = 0.0
-        on_u = None
         if pushed is not None:
-            weights = (pushed.force[:, None] * pushed.tangent.a).ravel()
-            at = pushed.conflicts.at.ravel()
-            phi = np.bincount(at, weights=weights, minlength=len(y)).astype(np.float64)
-            on_e, on_u = c.sampling.pull(phi[c.p])
-            pull += on_e
             gap = pushed.tangent.g + pushed.slack
             feasibility = max(0.0, -float(gap.min()))
             product = max(-float(pushed.force.min()), float(np.abs(pushed.force * gap).max()))
-        nu = c.costates(pull)
-        thrust = 2 * effort - nu @ model.B
-        if on_u is not None:
-            thrust -= on_u
-        gradient[: u.size] = thrust.ravel()
-        if c.moving_sizes:
-            gradient[u.size :] = 2 * w * away - (0.0 if pushed is None else phi[c.s])
+        lower, upper = (b[c.boxed] for b in bounds)
+        boxed = y[c.boxed]
+        excess = np.zeros(0)
+        if c.size > c.u.stop:  # changes and states can be beyond their bounds; nothing else can
+            beyond = np.maximum(0.0, np.maximum(lower - boxed, boxed - upper))
+            excess = beyond[c.yielding]
+            firm = beyond[: c.yielding.start].max()
+            yields = np.abs(reaction[c.yielding]) >= problem.state_slack_weight
+            feasibility = max(
+                feasibility, float(firm), float(np.where(yields, 0.0, excess).max(initial=0.0))
+            )
         if reaction.any():
-            boxed = y[c.boxed]
-            room = np.where(reaction > 0, boxed - c.lower[c.boxed], c.upper[c.boxed] - boxed)
-            product = max(product, float((np.abs(reaction) * room).max()))
-            gradient -= reaction
-        stationarity = float(np.abs(gradient).max()) / scale
-        residuals = KKTResiduals(stationarity, feasibility, product / max(1.0, cost))
-        return Point(y, e, nu, reaction, pushed, cost, residuals)
+            room = np.where(reaction > 0, boxed - lower, upper - boxed)
+            if len(excess):
+                room[c.yielding] += np.where(yields, excess, 0.0)
+            product = max(product, float(np.abs(reaction * room)[reaction != 0].max()))
+        residuals = KKTResiduals(stationarity / scale, feasibility, product / max(1.0, cost))
+        return Point(y, rolled, nu, reaction, pushed, cost, residuals, excess)

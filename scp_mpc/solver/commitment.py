@@ -51,5 +51,5 @@ def plan_risk(step: StepData, iterate: Iterate) -> PlanRisk:
     whole = points.sum(axis=(1, 2))
     stages = points.sum(axis=2)
     if step.problem.subsamples > 1:
-        stages[:, 1:] += points[:, :-1, -1]
+        stages[:, 1:] += points[:, :-1, -step.sampling.discs :].sum(axis=2)
     return PlanRisk(np.minimum(stages, 1.0), np.minimum(whole, 1.0), min(1.0, float(whole.sum())))

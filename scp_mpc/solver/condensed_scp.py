@@ -1,9 +1,9 @@
-"""Sequential convex programming on the condensed problem: the fast way for linear robots.
+"""Sequential convex programming on the condensed problem: the fast way.
 
-The plan that ignores the obstacles costs one linear system, or one program where inputs reach
-their bounds. If it is clear of every obstacle, nothing can be better. Else the descent of
-`newton.py` runs on the pairs of obstacle and point that are near; all others stay out, and are
-rechecked where it ends.
+The plan that ignores the obstacles costs one linear system, or one program where something else is
+bounded; for a nonlinear robot it is a descent of its own. If it is clear of every obstacle, nothing
+can be better. Else the descent runs on the pairs of obstacle and point that are near; all others
+stay out, and are rechecked where it ends.
 """
 
 from collections import Counter
@@ -18,36 +18,46 @@ from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram
 from scp_mpc.solver.certificate import Point
+from scp_mpc.solver.chart import Condensation
 from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.condensed_step import CondensedStep
 from scp_mpc.solver.conflicts import Conflicts
 from scp_mpc.solver.descent import Descent, Glimpse, judge
+from scp_mpc.solver.free_plan import FreePlan, free_linear, free_nonlinear
 from scp_mpc.solver.iterate import NEGLIGIBLE, Iterate, Multipliers, moved
 from scp_mpc.solver.newton import Newton
-from scp_mpc.solver.sampling import Sampling
+from scp_mpc.solver.sampling import LinearSampling, NonlinearSampling, Sampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.solver.trust_region import TrustRegion
+from scp_mpc.solver.varying import Varying
 
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
 _MANY = 200  # pairs of obstacle and stage beyond which sparse programs are quicker than dense ones
 
 
 class CondensedSCP:
-    """Solves control steps of a problem with linear dynamics and a positive definite Hessian.
+    """Solves control steps of a problem whose Hessian in the inputs is positive definite.
 
     Usage: `begin` a step; then `unhindered`, `free`, `glimpses` and `descend` as often as wanted.
     """
 
-    def __init__(self, problem: Problem, settings: Settings, condensed: Condensed) -> None:
+    def __init__(self, problem: Problem, settings: Settings, condensed: Condensation) -> None:
         """Set up the solver of the condensed programs."""
         self._problem, self._settings, self._condensed = problem, settings, condensed
-        self._qp = ActiveSetSolver(condensed.response[condensed.boxed])
+        self._layout = condensed.layout
+        self._qp = ActiveSetSolver(self._layout.variables)
+        self._search = Newton if isinstance(condensed, Condensed) else TrustRegion
         self._position = problem.model.position
         self._at: CondensedStep
+        self._free: FreePlan
 
     @classmethod
     def of(cls, problem: Problem, settings: Settings, sampling: Sampling) -> "CondensedSCP | None":
         """Condense a problem; None where the inputs' Hessian is singular."""
+        if isinstance(sampling, NonlinearSampling):
+            return cls(problem, settings, Varying(problem, sampling))
+        assert isinstance(sampling, LinearSampling)
         try:
             return cls(problem, settings, Condensed(problem, sampling))
         except (np.linalg.LinAlgError, RuntimeError):
@@ -58,17 +68,28 @@ class CondensedSCP:
         """Programs solved since `begin`, by solver."""
         return self._at.finished
 
-    def begin(self, step: StepData, watch: Stopwatch, like: "CondensedSCP | None" = None) -> None:
-        """Read a control step and find the plan that nothing constrains.
+    def begin(
+        self,
+        step: StepData,
+        watch: Stopwatch,
+        last: Iterate | None = None,
+        like: "CondensedSCP | None" = None,
+    ) -> None:
+        """Read a control step and find the plan that ignores the obstacles.
 
         Args:
             step: The control step.
             watch: Its clock.
+            last: The nominal plan, from which a nonlinear robot's free plan is sought.
             like: Who has begun the same step at other points.
         """
         self._qp.limit(watch.deadline)
-        known = None if like is None else like._at
-        self._at = CondensedStep(self._problem, self._condensed, self._qp, step, watch, known)
+        self._at = at = CondensedStep(self._problem, self._condensed, self._qp, step, watch)
+        known = None if like is None else (like._at, like._free)
+        if isinstance(self._condensed, Condensed):
+            self._free = free_linear(at, self._condensed, known)
+        else:
+            self._free = free_nonlinear(at, self._settings, last, known and known[1])
 
     def widen(self, step: StepData) -> None:
         """Take other radii or sizes for the step that has begun."""
@@ -76,20 +97,20 @@ class CondensedSCP:
 
     def unhindered(self) -> Descent | None:
         """The plan that ignores the obstacles, if it is clear of them all: none costs less."""
-        y, _ = self._at.within_bounds
-        if self._at.data.within(self._at.path(y), y[self._condensed.s], 0.0) is not None:
+        y = self._free.y
+        if self._at.data.within(self._at.path(y), y[self._layout.s], 0.0) is not None:
             return None
-        point = self._at.free_point()
+        point = self._free.point
         certified = point.residuals.worst <= self._settings.tolerance
         return self._ended(point, np.inf, 0) if certified else None
 
     def free(self) -> Iterate:
         """The plan that ignores the obstacles, which may not be clear of them."""
-        return self._iterate(self._at.free_point(), np.inf)
+        return self._iterate(self._free.point, np.inf)
 
     def free_path(self) -> FloatArray:
         """Its positions (C, d)."""
-        return self._at.path(self._at.within_bounds[0])[1:]
+        return self._at.path(self._free.y)[1:]
 
     def descend(self, nominal: Iterate, limit: int, goal: Descent | None = None) -> Descent | None:
         """Descend from a nominal plan; None if given up, or if a program could not be solved.
@@ -99,14 +120,16 @@ class CondensedSCP:
             limit: Iterations at most.
             goal: Give up when it is plain that this plan will not be reached.
         """
-        at, c, data = self._at, self._condensed, self._at.data
+        at, c, data = self._at, self._layout, self._at.data
+        first = self._condensed.sampling.first
         if not data.count:  # the free plan was the only one, and it did not hold up
             return None
-        if not at.watch.affords(c.sampling.first):
+        if not at.watch.affords(first):
             return None
         began = at.watch.elapsed
-        p = c.sampling.positions(nominal.states, nominal.inputs) - data.track[1:]
-        y = np.concatenate([p.ravel(), nominal.inputs.ravel(), nominal.s])
+        p = self._condensed.sampling.positions(nominal.states, nominal.inputs) - data.track[1:]
+        e = nominal.states[1:] - data.x_ref[1:]
+        y = c.outputs(data, p, nominal.s, nominal.inputs, e)
         near = touched = nominal.touched[: data.count]
         bounds, iterations = self._active_bounds(nominal), 0
         last: Descent | None = None
@@ -116,19 +139,20 @@ class CondensedSCP:
                 return last
             conflicts = Conflicts(data, c, near)
             active = np.concatenate([bounds, -touched[near].astype(np.intp)])
-            newton = Newton(at, conflicts, self._settings, goal)
-            end = newton.descend(y, active, limit - iterations, began)
+            search = self._search(at, conflicts, self._settings, goal)
+            end = search.descend(y, active, limit - iterations, began, e)
             if end is None:
                 return last
             landing = at.watch.elapsed
-            iterations, y = iterations + end.iterations, end.point.y
+            iterations += end.iterations
+            y, e = end.point.y, end.point.rolled.deviations
             missed = data.within(at.path(y), y[c.s], 0.0, known=near)
             depths = None if missed is None else data.depths(at.path(y)[1:], y[c.s])
             last = self._ended(end.point, end.cap, iterations, depths)
             at.watch.learn("landing", landing)
             if missed is None:
                 return last
-            if iterations >= limit or not at.watch.affords(c.sampling.first):
+            if iterations >= limit or not at.watch.affords(first):
                 return last
             began = at.watch.elapsed
             bounds = end.active[: len(bounds)]
@@ -146,12 +170,12 @@ class CondensedSCP:
         """
         if not paths:
             return []
-        at, c, data = self._at, self._condensed, self._at.data
+        at, c, data = self._at, self._layout, self._at.data
         whole = np.empty((len(paths), len(data.track), len(self._position)))
         whole[:, 0], whole[:, 1:] = data.x0[self._position], paths
         here = whole[0].copy()
-        here[1:] = c.sampling.positions(best.states, best.inputs)
-        known = np.stack([at.path(at.within_bounds[0]), here])
+        here[1:] = self._condensed.sampling.positions(best.states, best.inputs)
+        known = np.stack([at.path(self._free.y), here])
         near = self._near(known, best.s, np.zeros((data.count, len(paths[0])), dtype=np.bool_))
         if self._too_many(near):
             return []
@@ -159,48 +183,47 @@ class CondensedSCP:
         with at.watch.linearising:
             a, b = conflicts.about(whole, best.s)
         with at.watch.solving:
-            A = np.einsum("ckw,kwn->ckn", a, conflicts.response)
-            b -= (a * at.y_free[conflicts.at]).sum(axis=2)
-        bounds, cap = self._active_bounds(best), np.inf if firm else self._problem.slack_weight
+            A = np.einsum("ckw,kwn->ckn", a, conflicts.response(at.chart))
+            b -= (a * at.chart.y_free[conflicts.at]).sum(axis=2)
+        bounds, yields = self._active_bounds(best), at.ladder(firm)[-1]
         found = []
         for rows, least, path in zip(A, b, paths, strict=True):
             if at.watch.remaining < 0:
                 break
-            found.append(self._glimpse(at.program(rows, least), bounds, cap, conflicts, best, path))
+            program = at.program(rows, least, yields)
+            found.append(self._glimpse(program, bounds, conflicts, best, path))
         return found
 
     def _glimpse(
         self,
         program: CondensedProgram,
         bounds: IntArray,
-        cap: float,
         conflicts: Conflicts,
         best: Iterate,
         path: FloatArray,
     ) -> Glimpse:
         shape = self._at.data.count, len(path)
         with self._at.watch.solving, self._at.watch.inside:
-            end = self._qp.glimpse(program, bounds, cap)
+            end = self._qp.glimpse(program, bounds)
         if end is None:
             nobody = np.zeros(shape, dtype=np.bool_)
-            samples = path[self._condensed.sampling.count - 1 :: self._condensed.sampling.count]
+            every = self._condensed.sampling.count
+            samples = path[every - 1 :: every]
             return Glimpse(np.inf, nobody, path, partial(moved, best, self._position, samples))
         self._at.finished["daqp"] += 1
         v, pushing = end
-        y = self._at.y(v)
-        merit = self._at.least + float(v @ v) / 2
-        if np.isfinite(cap):
-            merit += cap * float(np.maximum(program.b - program.A @ v, 0.0).sum())
+        y = self._at.chart.y(v)
+        merit = self._at.chart.least + float(v @ v) / 2 + program.penalty(v)
         start = partial(self._reached, best, y)
         return Glimpse(merit, conflicts.table(pushing, *shape), self._at.path(y)[1:], start)
 
     def _reached(self, best: Iterate, y: FloatArray) -> Iterate:
         """An iterate's bounds and sizes about the plan y."""
+        y, rolled = self._at.rolled(self._at.inputs(y), best.s)
         states = self._at.data.x_ref.copy()
-        inputs = y[self._condensed.u].reshape(-1, self._problem.model.nu)
         states[0] = self._at.data.x0
-        states[1:] += self._condensed.deviations(inputs)
-        return replace(best, states=states, inputs=inputs)
+        states[1:] += rolled.deviations
+        return replace(best, states=states, inputs=rolled.inputs)
 
     def _too_many(self, near: BoolArray) -> bool:
         """Whether a sparse program is quicker; with a deadline it is never asked."""
@@ -218,15 +241,16 @@ class CondensedSCP:
             near = near if more is None else near | more
         if near.any():
             return near
-        more = self._at.data.within(self._at.path(self._at.within_bounds[0]), s, _NEAR)
+        more = self._at.data.within(self._at.path(self._free.y), s, _NEAR)
         return ~near if more is None else more
 
     def _active_bounds(self, nominal: Iterate) -> IntArray:
         """Which bounded entries a nominal plan holds: -1 at lower, 1 at upper bounds."""
-        active = np.zeros(self._condensed.boxed.stop - self._condensed.boxed.start, dtype=np.intp)
-        duals = nominal.multipliers
+        c, duals = self._layout, nominal.multipliers
+        active = np.zeros(c.size - c.boxed.start, dtype=np.intp)
         if duals is not None:
-            forces = np.concatenate([duals.inputs.ravel(), duals.margin])[: len(active)]
+            parts = [duals.inputs.ravel(), duals.rates.ravel(), duals.states.ravel()]
+            forces = np.concatenate([duals.margin[: c.moving], *parts])
             active[forces < -NEGLIGIBLE], active[forces > NEGLIGIBLE] = -1, 1
         return active
 
@@ -234,9 +258,9 @@ class CondensedSCP:
         self, point: Point, cap: float, iterations: int, depths: FloatArray | None = None
     ) -> Descent:
         """Judge a point; `depths` (J, C) are its violations where pairs were left out."""
-        residuals, slack = point.residuals, point.slack
+        residuals, slack, at = point.residuals, point.slack, self._at
         if depths is None and residuals.feasibility > self._settings.tolerance:
-            depths = self._at.data.depths(self._at.path(point.y)[1:], point.y[self._condensed.s])
+            depths = at.data.depths(at.path(point.y)[1:], point.y[self._layout.s])
         most = 0.0 if point.pushed is None else float(point.pushed.slack.max())
         if depths is not None:
             most, slack = float(depths.max(initial=0.0)), float(depths.sum())
@@ -244,33 +268,31 @@ class CondensedSCP:
         return Descent(
             partial(self._iterate, point, cap, depths),
             point.cost,
-            point.cost + self._problem.slack_weight * slack,
+            at.merit(point.cost, slack, point.excess),
             residuals,
-            judge(residuals, most, self._settings.tolerance),
+            judge(residuals, max(most, point.excess.max(initial=0.0)), self._settings.tolerance),
             iterations,
         )
 
     def _iterate(self, point: Point, cap: float, depths: FloatArray | None = None) -> Iterate:
         """Name the parts of a point in the words of the problem."""
-        problem, c, data = self._problem, self._condensed, self._at.data
-        N, M, nu = problem.horizon, problem.max_obstacles, problem.model.nu
+        problem, c, data = self._problem, self._layout, self._at.data
         states = np.empty_like(data.x_ref)
         states[0] = data.x0
-        np.add(data.x_ref[1:], point.deviations, out=states[1:])
-        slack, forces = np.zeros((2, M, c.sampling.points))
-        margin: FloatArray = -point.reaction[N * nu :] if c.moving_sizes else np.zeros(M)
+        np.add(data.x_ref[1:], point.rolled.deviations, out=states[1:])
+        slack, forces = np.zeros((2, problem.max_obstacles, self._condensed.sampling.points))
+        margin, inputs, rates, limits = c.parted(-point.reaction)
         if point.pushed is not None:
             pairs, force = point.pushed.conflicts, point.pushed.force
             slack[pairs.obstacle, pairs.point] = point.pushed.slack
             forces[pairs.obstacle, pairs.point] = force
-            if not c.moving_sizes:  # the bound takes whatever pushes a size that cannot move
+            if not c.moving:  # the bound takes whatever pushes a size that cannot move
                 pull = force * point.pushed.tangent.a[:, -1]
-                margin = np.bincount(pairs.obstacle, weights=pull, minlength=M).astype(np.float64)
+                pulled = np.bincount(pairs.obstacle, weights=pull, minlength=len(margin))
+                margin = pulled.astype(np.float64)
         if depths is not None:
             slack[: data.count] = depths
-        inputs, pins = point.reaction[: N * nu].reshape(N, nu), forces
-        if np.isfinite(cap):
-            pins = forces - cap
-        duals = Multipliers(point.costates, -inputs, margin, -forces, pins)
-        u, s = point.y[c.u].reshape(N, nu), point.y[c.s]
-        return Iterate(states, u, s, slack, duals).frozen()
+        pins = forces - cap if np.isfinite(cap) else forces
+        duals = Multipliers(point.costates, inputs, margin, -forces, pins, limits, rates)
+        s, free = point.y[c.s], self._free.inputs
+        return Iterate(states, point.rolled.inputs, s, slack, duals, free).frozen()

@@ -1,9 +1,10 @@
 """One control step of the condensed problem: its free plan, its programs, its points.
 
-Notation as in `condensed.py` and `conflicts.py`.
+Notation as in `chart.py`, `conflicts.py` and `certificate.py`.
 """
 
 from collections import Counter
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +13,18 @@ from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.problem import Problem
 from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram, Held
 from scp_mpc.solver.certificate import Certificate, Point, Pushed
-from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.chart import Chart, Condensation, Rolled
 from scp_mpc.solver.conflicts import Conflicts, Tangent
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
+
+
+class Yielding(IntEnum):
+    """Who gives way where the constraints cannot all be met."""
+
+    NOBODY = 0
+    STATES = 1
+    EVERYBODY = 2
 
 
 class CondensedStep:
@@ -27,85 +36,66 @@ class CondensedStep:
         qp: Solves its programs.
         step: The control step.
         watch: Where its time goes.
-        like: The same step at other points, whose plan that ignores the obstacles is known.
 
     Attributes:
-        y_free: (ny,) the plan that nothing constrains.
+        chart: The condensed problem, about the plan that was last charted.
         finished: Programs solved, by solver.
     """
+
+    chart: Chart
 
     def __init__(
         self,
         problem: Problem,
-        condensed: Condensed,
+        condensed: Condensation,
         qp: ActiveSetSolver,
         step: StepData,
         watch: Stopwatch,
-        like: "CondensedStep | None" = None,
     ) -> None:
-        """Find the plan that nothing constrains, and the room it leaves to the bounds."""
+        """Read the step; there is no chart yet."""
         self.problem, self.condensed, self.data, self.watch = problem, condensed, step, watch
+        self.layout = condensed.layout
         self.finished: Counter[str] = Counter()
-        self._qp, self._certificate = qp, Certificate(problem, condensed)
-        with watch.solving:
-            if like is None:
-                self.y_free = condensed.start(step.x0, step.x_ref)
-            else:
-                self.y_free = condensed.started_like(like.condensed, like.y_free)
-                y, reaction = like.within_bounds
-                known = condensed.of_inputs(y[like.condensed.u], y[like.condensed.s])
-                self.within_bounds = known, reaction
-            box = self.y_free[condensed.boxed]
-            self._room = (
-                condensed.lower[condensed.boxed] - box,
-                (condensed.upper[condensed.boxed] - box),
-            )
-
-    @cached_property
-    def within_bounds(self) -> tuple[FloatArray, FloatArray]:
-        """The plan that ignores the obstacles: y (ny,) and the forces of its bounds (nf,)."""
-        lower, upper = self._room
-        nothing = np.zeros(len(lower))
-        if (lower <= 0).all() and (upper >= 0).all():
-            self.finished["kkt"] += 1
-            return self.y_free, nothing
-        none = np.zeros((0, self.condensed.response.shape[1])), np.zeros(0)
-        with self.watch.solving:
-            held = self.solve(self.program(*none), nothing.astype(np.intp), np.inf)
-        return (self.y_free, nothing) if held is None else (self.y(held.v), held.force)
-
-    @cached_property
-    def least(self) -> float:
-        """Cost of the plan that nothing constrains: any other costs |v|^2 / 2 more."""
-        c, problem = self.condensed, self.problem
-        u = self.y_free[c.u].reshape(-1, problem.model.nu)
-        states = self.data.x_ref.copy()
-        states[1:] += c.deviations(u)
-        return problem.cost(states, u, self.y_free[c.s], self.data.x_ref)
-
-    def y(self, v: FloatArray) -> FloatArray:
-        """Outputs (ny,) of a solution v (nv,)."""
-        moved: FloatArray = self.y_free + self.condensed.response @ v
-        return moved
+        self._qp, self._certificate = qp, Certificate(problem, condensed.layout)
+        condensed.begin(step)
+        self.bounds = self.layout.bounds(step)
 
     def path(self, y: FloatArray) -> FloatArray:
         """(C+1, d) positions of the robot in y, from now on [m]."""
-        return self.data.path(y[self.condensed.p])
+        return self.data.path(y[self.layout.p])
 
-    def convex(self, conflicts: Conflicts, tangent: Tangent) -> CondensedProgram:
-        """The convex subproblem about a tangent."""
-        A = np.einsum("kw,kwn->kn", tangent.a, conflicts.response)
-        away = (tangent.y - self.y_free)[conflicts.at]
-        return self.program(A, (tangent.a * away).sum(axis=1) - tangent.g)
+    def inputs(self, y: FloatArray) -> FloatArray:
+        """The inputs (N, nu) in y."""
+        return y[self.layout.u].reshape(self.layout.shape)
 
-    def program(self, A: FloatArray, b: FloatArray) -> CondensedProgram:
+    def ladder(self, firm: bool) -> tuple[Yielding, ...]:
+        """Who is to give way, one after the other: firm obstacles never do."""
+        states = (Yielding.STATES,) if self.layout.limits_states else ()
+        return Yielding.NOBODY, *states, *(() if firm else (Yielding.EVERYBODY,))
+
+    @cached_property
+    def nothing(self) -> tuple[FloatArray, FloatArray]:
+        """No half-spaces, A (0, nv) and b (0,)."""
+        return np.zeros((0, self.layout.variables)), np.zeros(0)
+
+    def convex(self, conflicts: Conflicts, tangent: Tangent) -> tuple[FloatArray, FloatArray]:
+        """The half-spaces A v >= b of a tangent."""
+        A = np.einsum("kw,kwn->kn", tangent.a, conflicts.response(self.chart))
+        away = (tangent.y - self.chart.y_free)[conflicts.at]
+        return A, (tangent.a * away).sum(axis=1) - tangent.g
+
+    def program(self, A: FloatArray, b: FloatArray, yields: Yielding) -> CondensedProgram:
         """The program with half-spaces A v >= b."""
-        return CondensedProgram(*self._room, A, b)
+        lower, upper = self.bounds
+        boxed = self.layout.boxed
+        box = self.chart.y_free[boxed]
+        cap = self._cap(len(b), yields)
+        return CondensedProgram(self.chart.boxed, lower[boxed] - box, upper[boxed] - box, A, b, cap)
 
-    def solve(self, program: CondensedProgram, active: IntArray, cap: float) -> Held | None:
+    def solve(self, program: CondensedProgram, active: IntArray) -> Held | None:
         """Solve it from an active set; see `ActiveSetSolver.solve`."""
         with self.watch.inside:
-            held = self._qp.solve(program, active, cap)
+            held = self._qp.solve(program, active)
         self.finished["daqp"] += held is not None
         return held
 
@@ -113,17 +103,70 @@ class CondensedStep:
         """See `ActiveSetSolver.consistent`."""
         return self._qp.consistent(program, held, tolerance)
 
-    def point(self, conflicts: Conflicts, held: Held) -> Point:
-        """Roll a solution out and certify it against the original problem."""
-        bounds = len(self._room[0])
-        y, e = self._certificate.rolled_out(self.y(held.v))
-        with self.watch.linearising:
-            tangent = conflicts.tangent(y)
-        slack = np.where(held.capped[bounds:], np.maximum(-tangent.g, 0.0), 0.0)
-        pushed = Pushed(tangent, held.force[bounds:], slack, conflicts)
-        return self._certificate.certify(y, e, held.force[:bounds], pushed)
+    def rolled(
+        self, inputs: FloatArray, s: FloatArray, guess: FloatArray | None = None
+    ) -> tuple[FloatArray, Rolled]:
+        """Clip inputs (N, nu) and sizes (M,) to their bounds and roll out; return y, and how."""
+        problem, size = self.problem, self.problem.size
+        inputs = np.minimum(np.maximum(inputs, problem.u_min), problem.u_max)
+        s = np.minimum(np.maximum(s, size.lower), size.upper)
+        rolled = self.condensed.rolled(inputs, guess)
+        y = self.layout.outputs(self.data, rolled.positions, s, inputs, rolled.deviations)
+        return y, rolled
 
-    def free_point(self) -> Point:
-        """The plan that ignores the obstacles, certified as the solution without them."""
-        y, reaction = self.within_bounds
-        return self._certificate.certify(*self._certificate.rolled_out(y), reaction, None)
+    def start(
+        self,
+        inputs: FloatArray,
+        s: FloatArray,
+        conflicts: Conflicts | None,
+        guess: FloatArray | None = None,
+    ) -> Point:
+        """The plan of inputs (N, nu) and sizes (M,), on which nothing pushes."""
+        y, rolled = self.rolled(inputs, s, guess)
+        pushed = None
+        if conflicts is not None:
+            nothing = np.zeros(len(conflicts.point))
+            pushed = Pushed(conflicts.tangent(y), nothing, nothing, conflicts)
+        return self.certify(y, rolled, np.zeros(self.layout.size - self.layout.boxed.start), pushed)
+
+    def point(self, conflicts: Conflicts | None, held: Held) -> Point:
+        """Roll a solution out and certify it against the original problem."""
+        bounds = len(self.chart.boxed)
+        y = self.chart.y(held.v)
+        y, rolled = self.rolled(self.inputs(y), y[self.layout.s], self.chart.guess(held.v))
+        pushed = None
+        if conflicts is not None:
+            with self.watch.linearising:
+                tangent = conflicts.tangent(y)
+            slack = np.where(held.capped[bounds:], np.maximum(-tangent.g, 0.0), 0.0)
+            pushed = Pushed(tangent, held.force[bounds:], slack, conflicts)
+        return self.certify(y, rolled, held.force[:bounds], pushed)
+
+    def certify(
+        self, y: FloatArray, rolled: Rolled, reaction: FloatArray, pushed: Pushed | None
+    ) -> Point:
+        """See `Certificate.certify`."""
+        return self._certificate.certify(y, rolled, reaction, pushed, self.bounds)
+
+    def costates(
+        self, rolled: Rolled, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
+    ) -> FloatArray:
+        """See `Certificate.costates`."""
+        return self._certificate.costates(rolled, e, reaction, pushed)[0]
+
+    def merit(self, cost: float, slack: float, excess: FloatArray) -> float:
+        """Cost and the penalties on all slack [m] and on the states' excess."""
+        merit = cost + self.problem.slack_weight * slack
+        if len(excess):
+            merit += self.problem.state_slack_weight * float(excess.sum())
+        return merit
+
+    def _cap(self, pairs: int, yields: Yielding) -> FloatArray | None:
+        """Largest forces (nf + K,) on a program's constraints; None for firm ones."""
+        if yields is Yielding.NOBODY:
+            return None
+        cap = np.full(len(self.chart.boxed) + pairs, np.inf)
+        cap[self.layout.yielding] = self.problem.state_slack_weight
+        if yields is Yielding.EVERYBODY:
+            cap[len(self.chart.boxed) :] = self.problem.slack_weight
+        return cap

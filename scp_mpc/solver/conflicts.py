@@ -15,7 +15,8 @@ import numpy as np
 from scp_mpc.arrays import BoolArray, FloatArray
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.chart import Chart
+from scp_mpc.solver.layout import Layout
 from scp_mpc.solver.step_data import StepData
 
 
@@ -42,26 +43,31 @@ class Conflicts:
     Attributes:
         obstacle: (K,) j; likewise `point`, i, counted from 0.
         at: (K, w) where position and size stand in y.
-        response: (K, w, nv) rows of S there.
 
     Args:
         step: The control step.
-        condensed: Where positions and sizes stand in y.
+        layout: Where positions and sizes stand in y.
         near: (J, C) the pairs.
     """
 
-    def __init__(self, step: StepData, condensed: Condensed, near: BoolArray) -> None:
+    def __init__(self, step: StepData, layout: Layout, near: BoolArray) -> None:
         """Gather the pairs' predictions."""
         self.obstacle, self.point = j, i = np.nonzero(near)
         d = step.problem.model.dim
         self.at = np.empty((len(j), d + 1), dtype=np.intp)
         self.at[:, :d] = i[:, None] * d + np.arange(d)
-        self.at[:, d] = condensed.s.start + j
-        self.response = condensed.response[self.at]
-        self._step, self._p = step, condensed.p
+        self.at[:, d] = layout.s.start + j
+        self._step, self._p = step, layout.p
+        self._chart: Chart | None = None
         covariances = step.covariances[j, i + 1]
         self._sets = NoGoSets.pairs(step.means[j, i + 1], covariances, step.radii[j, i])
         self._means_before = step.means[j, i]
+
+    def response(self, chart: Chart) -> FloatArray:
+        """(K, w, nv) rows of the chart's response."""
+        if self._chart is not chart:
+            self._chart, self._response = chart, chart.response[self.at]
+        return self._response
 
     def about(self, paths: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Linearise about several paths (c, C+1, d) at sizes s (M,) at once.

@@ -14,16 +14,20 @@ problem's KKT conditions,
 and I - L' P L is positive definite: the second-order condition. Where it is not, the convex steps
 lead away from this point, and there is nothing to sum.
 
+Where the dynamics bend, too, the second derivative of the Lagrangian is I + W with any symmetric W,
+and Newton's step goes on from the convex one within the null space of A: P (I + W) P z = -P W d.
+
 Notation:
     d   (nv,)       step of the condensed problem
     A   (k, nv)     responses of the active constraints
     L   (q, nv)     responses of the bends, each times the root of its force
+    W   (nv, nv)    what the convex program leaves out; -L'L for a linear robot
 """
 
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg.lapack import dposv, dpotrs
+from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.solver.active_set import Held
@@ -50,3 +54,30 @@ def summed(held: Held, bends: FloatArray, step: FloatArray) -> Held | None:
     force = held.force.copy()
     force[held.indices] -= change
     return replace(held, v=held.v + turn @ bends - change @ held.rows, force=force)
+
+
+def newton_step(held: Held, step: FloatArray, W: FloatArray) -> Held | None:
+    """Return the solution to which Newton's step leads; None without the second-order condition.
+
+    Args:
+        held: Solution of the convex subproblem.
+        step: (nv,) d, from the plan to it.
+        W: (nv, nv) as above.
+    """
+    M = W.copy()
+    M.flat[:: len(M) + 1] += 1.0
+    left = W @ step
+    if len(held.indices):
+        R, _ = dtrtrs(held.factor, held.rows, trans=1)  # orthonormal rows that span A's
+        across = R @ M
+        M -= R.T @ across + across.T @ R - R.T @ (across @ R.T) @ R
+        M += R.T @ R
+        left = left - R.T @ (R @ left)
+    _, z, info = dposv(M, -left)
+    if info != 0:
+        return None
+    force = held.force.copy()
+    if len(held.indices):
+        change, _ = dpotrs(held.factor, held.rows @ (W @ (step + z)))
+        force[held.indices] += change
+    return replace(held, v=held.v + z, force=force)

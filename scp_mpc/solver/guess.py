@@ -22,10 +22,11 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
         raise InvalidArgumentError("guess", f"{guess!r} is neither a Trajectory nor an Iterate")
     if isinstance(guess, Trajectory):
         s = np.full(M, problem.size.reference)
-        guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N)))
+        guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N * len(problem.discs))))
     path = {"states": (N + 1, model.nx), "inputs": (N, model.nu)}
-    fine = guess.slack.shape == (M, N * problem.subsamples)
-    points = N * problem.subsamples if fine else N
+    coarse = N * len(problem.discs)
+    fine = guess.slack.shape == (M, coarse * problem.subsamples)
+    points = coarse * problem.subsamples if fine else coarse
     _check(guess, {**path, "s": (M,), "slack": (M, points)})
     if guess.multipliers is not None:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}

@@ -6,12 +6,12 @@ Notation:
     C               points at which obstacles are constrained: N, or K in each of N intervals
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.robots.model import Model
 
 NEGLIGIBLE = 1e-6  # [cost / m, or per unit of input]; interior points leave none exactly zero
 
@@ -26,6 +26,8 @@ class Multipliers:
         margin: (M,) of the bounds on s.
         obstacles: (M, C) of the obstacles' constraints, never positive.
         slack: (M, C) of slack = 0, or of slack >= 0 where it is free.
+        states: (N, nb) of the bounds on states; empty where there are none.
+        rates: (N, nu) of the bounds on the inputs' changes; likewise.
     """
 
     dynamics: FloatArray
@@ -33,6 +35,8 @@ class Multipliers:
     margin: FloatArray
     obstacles: FloatArray
     slack: FloatArray
+    states: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    rates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def shifted(self) -> "Multipliers":
         """Move every stage one step earlier and repeat the last one."""
@@ -42,6 +46,8 @@ class Multipliers:
             self.margin,
             _shifted(self.obstacles, 1, len(self.inputs)),
             _shifted(self.slack, 1, len(self.inputs)),
+            _shifted(self.states, 0),
+            _shifted(self.rates, 0),
         )
 
     def resampled(self, count: int) -> "Multipliers":
@@ -54,13 +60,23 @@ class Multipliers:
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """A primal-dual point. Without multipliers only the primal part is warm-started."""
+    """A primal-dual point. Without multipliers only the primal part is warm-started.
+
+    Attributes:
+        states: X.
+        inputs: U.
+        s: Sizes.
+        slack: Violations.
+        multipliers: Those of all constraints, or None.
+        free: (N, nu) inputs of the plan that ignores the obstacles; nonlinear robots' only.
+    """
 
     states: FloatArray
     inputs: FloatArray
     s: FloatArray
     slack: FloatArray
     multipliers: Multipliers | None = None
+    free: FloatArray | None = None
 
     @property
     def touches(self) -> bool:
@@ -83,7 +99,7 @@ class Iterate:
             array.setflags(write=False)
         return self
 
-    def shifted(self, model: LinearModel) -> "Iterate":
+    def shifted(self, model: Model) -> "Iterate":
         """Return the iterate one step later: the last input is held, its end state appended."""
         last = model.step(self.states[-1], self.inputs[-1])
         return Iterate(
@@ -92,6 +108,7 @@ class Iterate:
             self.s,
             _shifted(self.slack, 1, len(self.inputs)),
             None if self.multipliers is None else self.multipliers.shifted(),
+            None if self.free is None else _shifted(self.free, 0),
         )
 
     def resampled(self, count: int) -> "Iterate":
@@ -114,6 +131,8 @@ def moved(iterate: Iterate, position: IntArray, path: FloatArray) -> Iterate:
 def _shifted(values: FloatArray, axis: int, stages: int = 0) -> FloatArray:
     """Drop the first stage along `axis` and repeat the last; a stage may have several entries."""
     size = values.shape[axis]
+    if not size:
+        return values
     count = size // stages if stages else 1
     places = np.arange(size) + count
     places[size - count :] -= count

@@ -10,11 +10,13 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
 from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
 from scp_mpc.solver.step_data import StepData
+from scp_mpc.trajectory import rollout
 
 _AT_REST = 1e-9  # of an input, in its own unit, that is none
 
@@ -28,9 +30,13 @@ class Ladder:
     """
 
     def __init__(self, problem: Problem, tolerance: float) -> None:
-        """Find the response of all states to the state now and to all inputs."""
+        """Find the response of a linear robot's states to the state now and to all inputs."""
         self._problem, self._tolerance = problem, tolerance
-        model, N = problem.model, problem.horizon
+        self._response: FloatArray | None = None
+        if isinstance(problem.model, LinearModel):
+            self._respond(problem.model, problem.horizon)
+
+    def _respond(self, model: LinearModel, N: int) -> None:
         powers = [np.eye(model.nx)]
         response = np.zeros((N, model.nx, N, model.nu))
         with np.errstate(over="ignore", invalid="ignore"):  # then nothing rolled out is judged safe
@@ -60,7 +66,7 @@ class Ladder:
     def brake(self, step: StepData, status: Status = Status.BRAKING) -> Descent:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
         problem, model, x = self._problem, self._problem.model, step.x0
-        rest = np.clip(np.zeros(model.nu), problem.u_min, problem.u_max)
+        rest = np.clip(model.idle, problem.u_min, problem.u_max)
         most, least = problem.u_max - rest, problem.u_min - rest
         U = np.tile(rest, (problem.horizon, 1))
         for u in U:
@@ -79,19 +85,23 @@ class Ladder:
     def _judged(self, step: StepData, inputs: FloatArray, status: Status) -> Descent:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
         problem = self._problem
-        states = np.empty((problem.horizon + 1, problem.model.nx))
-        states[0] = step.x0
-        states[1:] = (self._drift @ step.x0 + self._response @ inputs.ravel()).reshape(
-            -1, problem.model.nx
-        )
+        states = self._rolled_out(step.x0, inputs)
         s = np.full(problem.max_obstacles, problem.size.reference)
         s[: step.count] = problem.size.lower  # all that a plan without a search can promise
         slack = np.zeros((problem.max_obstacles, step.sampling.points))
         slack[: step.count] = step.depths(step.sampling.positions(states, inputs), s)
-        most = float(slack.max(initial=0.0))
+        most = max(float(slack.max(initial=0.0)), float(problem.excess(states).max()))
         if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
         cost = problem.cost(states, inputs, s, step.x_ref)
-        merit = cost + problem.slack_weight * float(slack.sum())
+        merit = cost + problem.penalty(slack, states)
         residuals = KKTResiduals(np.inf, most, np.inf)
         return Descent(Iterate(states, inputs, s, slack).frozen, cost, merit, residuals, status, 0)
+
+    def _rolled_out(self, x0: FloatArray, inputs: FloatArray) -> FloatArray:
+        """States (N+1, nx) to which inputs lead."""
+        model = self._problem.model
+        if self._response is None:
+            return rollout(model.step, x0, inputs).states
+        after = self._drift @ x0 + self._response @ inputs.ravel()
+        return np.concatenate([x0[None], after.reshape(-1, model.nx)])

@@ -15,6 +15,7 @@ from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.engine import Engine
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
+from scp_mpc.solver.sampling import LinearSampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 from scp_mpc.solver.sweep import Sweep, swept, too_fast
@@ -40,15 +41,22 @@ class Resolution:
         if self._covers_gaps:
             self.fine = Engine(problem, settings, problem.subsamples)
 
+    @property
+    def wants_nominal(self) -> bool:
+        """Whether even the plan that ignores the obstacles is sought from the nominal one."""
+        return not isinstance(self.coarse.sampling, LinearSampling)
+
     def forget(self) -> None:
         """Forget what earlier programs left behind."""
         self.coarse.forget()
         self.fine.forget()
 
-    def begin(self, step: StepData, watch: Stopwatch) -> tuple[Engine, StepData, Descent | None]:
+    def begin(
+        self, step: StepData, watch: Stopwatch, last: Iterate | None = None
+    ) -> tuple[Engine, StepData, Descent | None]:
         """Begin a step at the samples; the third is the free plan, if that is clear."""
         engine, wide = self.coarse, step
-        engine.begin(step, watch)
+        engine.begin(step, watch, last)
         if self._covers_gaps and step.count:
             wide = self.widened(engine, step, engine.free_sweep())
         best = engine.unhindered()
@@ -72,7 +80,7 @@ class Resolution:
             return coarse, step, None
         began = watch.elapsed
         step = step.sampled(fine.sampling)
-        fine.begin(step, watch, like=coarse)
+        fine.begin(step, watch, last, like=coarse)
         wide = self.widened(fine, step, fine.free_sweep())
         best = fine.unhindered()
         watch.learn("refining", began)
@@ -108,7 +116,7 @@ class Resolution:
         if engine is self.fine or not watch.affords("refining", self.fine.sampling.first):
             return engine, step
         step = step.sampled(self.fine.sampling)
-        self.fine.begin(step, watch, like=self.coarse)
+        self.fine.begin(step, watch, None, like=self.coarse)
         return self.fine, step
 
 

@@ -161,9 +161,11 @@ class SCP:
         if nominal is None:
             self.forget()
         last = None
-        engine, step, free = self._resolution.begin(step, watch)
+        if nominal is not None and self._resolution.wants_nominal:
+            last = nominal()
+        engine, step, free = self._resolution.begin(step, watch, last)
         if free is None:
-            last = None if nominal is None else nominal()
+            last = nominal() if last is None and nominal is not None else last
             engine, step, free = self._resolution.refined(step, watch, last)
         if free is not None:
             return self._plan(step, Found(free), watch, self._resolution.finished(engine))

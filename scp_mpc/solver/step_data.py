@@ -50,6 +50,7 @@ class StepData:
     radii: FloatArray
     robot_covariance: FloatArray | None = None
     scale: FloatArray | None = None
+    u_last: FloatArray | None = None
 
     @classmethod
     def read(
@@ -86,10 +87,11 @@ class StepData:
             uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
             uncertain = np.broadcast_to(uncertain, (N + 1, *shape))
             require_positive_semidefinite("robot_covariance", uncertain)
-        sampling = Sampling(model, N, 1) if sampling is None else sampling
+        sampling = Sampling.of(problem, 1) if sampling is None else sampling
         means = np.array([o.means for o in obstacles]).reshape(-1, N + 1, model.dim)
         radii = problem.robot_radius + np.array([o.radius for o in obstacles])
-        radii = np.repeat(radii[:, None], N, axis=1)
+        radii = np.repeat(radii[:, None], sampling.points, axis=1)
+        means = sampling.interpolated(means)
         step = cls(problem, state, reference, obstacles, sampling, means, radii, uncertain)
         return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
 
@@ -127,11 +129,13 @@ class StepData:
     @cached_property
     def drift(self) -> FloatArray:
         """Way of the obstacles between two points (J, C) [m]; see `sweep.py`."""
-        way, count = self.means[:, 1:] - self.means[:, :-1], self.sampling.count
+        sampling, now = self.sampling, self.means[:, :1]
+        means = np.concatenate([now, self.means[:, sampling.discs :: sampling.discs]], axis=1)
         variances = np.array([o.spread for o in self.obstacles]) ** 2
-        growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0)) / count
-        length: FloatArray = np.sqrt(_squared(way))
-        return length + _SIGMAS * np.repeat(growth, count, axis=1)
+        growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0))
+        growth = np.repeat(growth / sampling.instants, sampling.instants, axis=1)
+        length: FloatArray = np.sqrt(_squared(means[:, 1:] - means[:, :-1]))
+        return sampling.repeated(length + _SIGMAS * growth, axis=1)
 
     @cached_property
     def sets(self) -> NoGoSets:
@@ -155,7 +159,7 @@ class StepData:
         states[0] = self.x0
         track = np.empty((self.sampling.points + 1, model.dim))
         track[0] = self.x0[model.position]
-        track[1:] = self.sampling.positions(states, np.zeros((len(states) - 1, model.nu)))
+        track[1:] = self.sampling.track(states, model.nu)
         return track
 
     def path(self, deviations: FloatArray) -> FloatArray:
@@ -199,8 +203,9 @@ class StepData:
 
     def sampled(self, sampling: Sampling) -> "StepData":
         """The same with predictions at other points; coarse to fine only."""
-        means = sampling.interpolated(self.means)
-        radii = np.repeat(self.radii, sampling.count, axis=1)
+        shape = self.count, -1, self.problem.model.dim
+        means = sampling.interpolated(np.array([o.means for o in self.obstacles]).reshape(shape))
+        radii = np.repeat(self.radii, sampling.instants, axis=1)
         step = replace(self, sampling=sampling, means=means, radii=radii, scale=None)
         return step if isinstance(self.problem.margin, Margin) else step.scaled_uniformly()
 

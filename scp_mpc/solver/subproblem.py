@@ -21,10 +21,11 @@ from scipy import sparse
 
 from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
-from scp_mpc.solver.sampling import Sampling
+from scp_mpc.solver.sampling import LinearSampling, Sampling
 from scp_mpc.solver.sparse_blocks import SparseBlocks
 
 
@@ -41,7 +42,10 @@ class Subproblem:
         """Lay out variables and rows and write the constant values."""
         self._problem = problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        self._sampling = Sampling(model, N, 1) if sampling is None else sampling
+        sampling = Sampling.of(problem, 1) if sampling is None else sampling
+        assert isinstance(model, LinearModel)
+        assert isinstance(sampling, LinearSampling)
+        self._model, self._sampling = model, sampling
         C = self._sampling.points
         columns = [N * model.nx, N * model.nu, M, M * C]
         rows = [N * model.nx, N * model.nu, M, M * C, M * C]
@@ -78,7 +82,7 @@ class Subproblem:
         """Write the state x0 (nx,) and the reference x_ref (N+1, nx) of a control step."""
         self._x0, self._reference = x0, x_ref[1:]
         before = np.concatenate([x0[None], x_ref[1:-1]])
-        drift = before @ self._problem.model.A.T - x_ref[1:]
+        drift = before @ self._model.A.T - x_ref[1:]
         self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = drift.ravel()
         model = self._problem.model
         still = np.zeros((len(before), model.nu))
@@ -176,8 +180,8 @@ class Subproblem:
         blocks = SparseBlocks()
         diagonal = np.arange(N * model.nx)
         blocks.add("next", self._dynamics.start + diagonal, self._x.start + diagonal, 1.0)
-        blocks.add("A", row[1:], state[:-1], -model.A)
-        blocks.add("B", row, control, -model.B)
+        blocks.add("A", row[1:], state[:-1], -self._model.A)
+        blocks.add("B", row, control, -self._model.B)
         for name, rows, columns in (
             ("inputs", self._inputs, self._u),
             ("margin", self._margin, self._s),

@@ -37,11 +37,11 @@ class Sweep:
 
     @classmethod
     def of(cls, path: FloatArray) -> "Sweep":
-        """Measure a path (C+1, d)."""
+        """Measure a path (C+1, d), or those of several discs (C+1, n, d)."""
         way = path[1:] - path[:-1]
         turn = way[1:] - way[:-1]
-        chord = np.sqrt(np.add.reduce(way * way, axis=1).max())
-        sag = np.sqrt(np.add.reduce(turn * turn, axis=1).max(initial=0.0)) / 8
+        chord = np.sqrt(np.add.reduce(way * way, axis=-1).max(initial=0.0))
+        sag = np.sqrt(np.add.reduce(turn * turn, axis=-1).max(initial=0.0)) / 8
         return cls(float(chord), float(sag))
 
     def and_more(self, *others: "Sweep") -> "Sweep":

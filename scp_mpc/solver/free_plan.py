@@ -1,0 +1,99 @@
+"""The plan that ignores the obstacles: no other costs less."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.settings import Settings
+from scp_mpc.solver.certificate import Point
+from scp_mpc.solver.condensed import Condensed
+from scp_mpc.solver.condensed_step import CondensedStep
+from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.trust_region import TrustRegion
+
+
+@dataclass(frozen=True, eq=False)
+class FreePlan:
+    """The plan that ignores the obstacles, in one control step.
+
+    Attributes:
+        y: (ny,) its outputs.
+        reaction: (nf,) forces of its bounds.
+        certify: Makes `point`.
+        inputs: (N, nu) to begin from in the next step; None where there is no need to.
+    """
+
+    y: FloatArray
+    reaction: FloatArray
+    certify: Callable[[], Point]
+    inputs: FloatArray | None = None
+
+    @cached_property
+    def point(self) -> Point:
+        """The plan, certified as the solution without obstacles."""
+        return self.certify()
+
+
+def free_linear(
+    at: CondensedStep, condensed: Condensed, known: tuple[CondensedStep, FreePlan] | None
+) -> FreePlan:
+    """Chart a step of a linear robot and find its free plan: by a linear system or one program.
+
+    Args:
+        at: The step.
+        condensed: Its problem.
+        known: The same step at other points, and its free plan.
+    """
+    with at.watch.solving:
+        if known is not None:
+            like, plan = known
+            at.chart = condensed.chart(like.inputs(like.chart.y_free))
+            y, _ = at.rolled(like.inputs(plan.y), plan.y[like.layout.s])
+            return _certified(at, y, plan.reaction)
+        at.chart = condensed.chart()
+    y, nothing = at.chart.y_free, np.zeros(len(at.chart.boxed))
+    lower, upper = (bound[at.layout.boxed] for bound in at.bounds)
+    if (lower <= y[at.layout.boxed]).all() and (upper >= y[at.layout.boxed]).all():
+        at.finished["kkt"] += 1
+        return _certified(at, y, nothing)
+    for yields in at.ladder(firm=True):
+        with at.watch.solving:
+            held = at.solve(at.program(*at.nothing, yields), nothing.astype(np.intp))
+        if held is not None:
+            return _certified(at, at.chart.y(held.v), held.force)
+    return _certified(at, y, nothing)
+
+
+def _certified(at: CondensedStep, y: FloatArray, reaction: FloatArray) -> FreePlan:
+    def certify() -> Point:
+        return at.certify(*at.rolled(at.inputs(y), y[at.layout.s]), reaction, None)
+
+    return FreePlan(y, reaction, certify)
+
+
+def free_nonlinear(
+    at: CondensedStep, settings: Settings, last: Iterate | None, known: FreePlan | None
+) -> FreePlan:
+    """Descend to the free plan of a nonlinear robot.
+
+    Args:
+        at: The step.
+        settings: How to descend.
+        last: The nominal plan, which knows the free plan of the step before; or None.
+        known: The free plan of the same step at other points.
+    """
+    problem, N = at.problem, at.problem.horizon
+    active = np.zeros(at.layout.size - at.layout.boxed.start, dtype=np.intp)
+    inputs = np.tile(problem.model.idle, (N, 1))
+    if known is not None and known.inputs is not None:
+        inputs, active = known.inputs, -np.sign(known.reaction).astype(np.intp)
+    elif last is not None:
+        inputs = last.inputs if last.free is None else last.free
+    sizes = np.full(problem.max_obstacles, problem.size.reference)
+    start = at.start(inputs, sizes, None)
+    end = TrustRegion(at, None, settings).descend_from(start, active, settings.max_iterations)
+    point = start if end is None else end.point
+    return FreePlan(point.y, point.reaction, lambda: point, point.rolled.inputs)

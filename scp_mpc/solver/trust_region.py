@@ -1,0 +1,200 @@
+"""The descent for nonlinear robots: convex programs within a trust region, judged by a merit.
+
+    repeat:  linearise dynamics and obstacles about the plan -> convex program in the trust region
+             -> Newton's step on the original problem, for the active set that came out
+             -> roll its inputs out: the trial
+             -> accept if the merit falls as predicted, or the KKT residual by half; else shrink
+    until    the KKT residual of the original problem is below the tolerance
+
+The merit is cost and penalty on all violations; its weight exceeds the forces met so far. A plan is
+always rolled out, so it needs no term for defects (`varying.py`). The region bounds what the inputs
+change by; as constraints of the program its bounds push, so that no point that they hold is ever
+certified.
+"""
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.settings import Settings
+from scp_mpc.solver.active_set import CondensedProgram, Held
+from scp_mpc.solver.certificate import Point, Pushed
+from scp_mpc.solver.condensed_step import CondensedStep, Yielding
+from scp_mpc.solver.conflicts import Conflicts, Tangent
+from scp_mpc.solver.curvature import newton_step
+from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.iterate import NEGLIGIBLE
+from scp_mpc.solver.search import ROUNDING, SURPLUS, End, Search
+from scp_mpc.solver.varying import Varying, VaryingChart
+
+_ENOUGH = 0.01  # share of the predicted decrease that a trial must bring
+_SHRINK, _GROW = 0.3, 3.0
+_SMALLEST = 1e-8  # trust region, relative to the inputs' range, at which to give up
+_WEIGHT = 2.0  # of the merit's penalty over the largest force
+_NOISE = 1e-12  # of the merit, relative
+
+
+class TrustRegion(Search):
+    """Descends about some pairs of obstacle and point of a nonlinear robot; see `Search`."""
+
+    def __init__(
+        self,
+        step: CondensedStep,
+        conflicts: Conflicts | None,
+        settings: Settings,
+        goal: Descent | None = None,
+    ) -> None:
+        """Begin with a trust region without limits."""
+        super().__init__(step, conflicts, settings, goal)
+        problem = step.problem
+        span = (problem.u_max - problem.u_min) / 2
+        self._span = np.where(span > 0, span, 1.0)
+        self._radius, self._weight = np.inf, 0.0
+        self._about: Point
+
+    def descend(
+        self,
+        y: FloatArray,
+        active: IntArray,
+        limit: int,
+        began: float = 0.0,
+        guess: FloatArray | None = None,
+    ) -> End | None:
+        """See the base class; the first half-spaces are about y, the dynamics about its inputs."""
+        step, conflicts = self._step, self._conflicts
+        tangent = None if conflicts is None else conflicts.tangent(y)
+        with step.watch.solving:
+            start = step.start(step.inputs(y), y[step.layout.s], conflicts, guess)
+        return self.descend_from(start, active, limit, began, tangent)
+
+    def descend_from(
+        self,
+        start: Point,
+        active: IntArray,
+        limit: int,
+        began: float = 0.0,
+        tangent: Tangent | None = None,
+    ) -> End | None:
+        """Descend from a plan; the first half-spaces are a tangent's, if one is given."""
+        watch, first = self._step.watch, self._step.condensed.sampling.first
+        point, end, residual = start, None, np.inf
+        self._chart(start)
+        for iteration in range(1, limit + 1):
+            task = first if iteration == 1 else "program"
+            if iteration > 1:
+                if not watch.affords(task):
+                    break
+                began = watch.elapsed
+            self._about = point
+            solved = self._convex(tangent or self._tangent(point), active)
+            if solved is None:
+                watch.learn(task, began)
+                break
+            program, held = solved
+            trial = self._trial(tangent or self._tangent(point), program, held)
+            better = trial.residuals.worst
+            if not self._accepted(point, trial, program, held, residual):
+                self._shrink(point, held)
+                watch.learn(task, began)
+                if self._radius < _SMALLEST:
+                    break
+                continue
+            point, tangent, before, residual = trial, None, residual, better
+            end = End(trial, held.active, self._cap, iteration)
+            active = held.active
+            watch.learn(task, began)
+            if better <= SURPLUS * self._tolerance or max(better, before) <= self._tolerance:
+                break
+            if self._goal is not None and self._vain(iteration, trial, self._goal):
+                return None
+            self._chart(point)
+        return end
+
+    def _tangent(self, point: Point) -> Tangent | None:
+        return None if point.pushed is None else point.pushed.tangent
+
+    def _chart(self, point: Point) -> None:
+        with self._step.watch.linearising:
+            condensed = self._step.condensed
+            assert isinstance(condensed, Varying)
+            self._step.chart = condensed.chart(point.rolled, point.y[self._step.layout.s])
+
+    def _convex(
+        self, tangent: Tangent | None, active: IntArray
+    ) -> tuple[CondensedProgram, Held] | None:
+        with self._step.watch.solving:
+            if tangent is None or self._conflicts is None:
+                return self._solved(*self._step.nothing, active)
+            return self._solved(*self._step.convex(self._conflicts, tangent), active)
+
+    def _program(self, A: FloatArray, b: FloatArray, yields: Yielding) -> CondensedProgram:
+        """A program within the trust region about the plan."""
+        program, c = self._step.program(A, b, yields), self._step.layout
+        if np.isfinite(self._radius):
+            u = self._about.y[c.u] - self._step.chart.y_free[c.u]
+            reach = self._radius * np.tile(self._span, c.shape[0])
+            program.lower[c.inputs] = np.maximum(program.lower[c.inputs], u - reach)
+            program.upper[c.inputs] = np.minimum(program.upper[c.inputs], u + reach)
+        return program
+
+    def _trial(self, tangent: Tangent | None, program: CondensedProgram, held: Held) -> Point:
+        """Roll out Newton's step, or the convex one where the active set is about to change."""
+        whole = self._newton(tangent, held)
+        if whole is not None and self._step.consistent(program, whole, ROUNDING):
+            held = whole
+        return self._step.point(self._conflicts, held)
+
+    def _newton(self, tangent: Tangent | None, held: Held) -> Held | None:
+        """Newton's step on the original problem's KKT conditions for an active set."""
+        step, chart, conflicts = self._step, self._step.chart, self._conflicts
+        assert isinstance(chart, VaryingChart)
+        bounds, bends, pushed = len(chart.boxed), np.zeros((0, len(held.v))), None
+        force = held.force[bounds:]
+        if conflicts is not None and tangent is not None:
+            pushed = Pushed(tangent, force, np.zeros(len(force)), conflicts)
+            pairs = (force > NEGLIGIBLE).nonzero()[0]
+            L = conflicts.bend(tangent)[pairs] * np.sqrt(force[pairs])[:, None, None]
+            bends = np.einsum("kwm,kwn->kmn", L, conflicts.response(chart)[pairs])
+            bends = bends.reshape(-1, bends.shape[-1])
+        rolled, e = self._about.rolled, chart.guess(held.v)
+        nu = step.costates(rolled, e, held.force[:bounds], pushed)
+        states = step.data.x_ref.copy()
+        states[0] = step.data.x0
+        states[1:] += rolled.deviations
+        hessians = step.problem.model.curvature(states[:-1], rolled.inputs, -nu)
+        W = chart.curvature(hessians, chart.response[step.layout.u]) - bends.T @ bends
+        return newton_step(held, held.v - chart.here, W)
+
+    def _accepted(
+        self, point: Point, trial: Point, program: CondensedProgram, held: Held, residual: float
+    ) -> bool:
+        """Whether a trial brings enough of what its program predicted."""
+        if not np.isfinite(trial.cost):
+            return False
+        problem = self._step.problem
+        largest = float(np.abs(held.force[len(program.lower) :]).max(initial=0.0))
+        self._weight = min(max(self._weight, _WEIGHT * largest), problem.slack_weight)
+        if self._yields is Yielding.EVERYBODY:
+            self._weight = problem.slack_weight
+        chart = self._step.chart
+        assert isinstance(chart, VaryingChart)
+        before, after = self._merit(point), self._merit(trial)
+        model = chart.least + float(held.v @ held.v) / 2 + program.penalty(held.v)
+        predicted, actual = before - model, before - after
+        if actual >= _ENOUGH * predicted - _NOISE * abs(before):
+            if actual >= predicted / 2:
+                self._radius *= _GROW
+            return True
+        return trial.residuals.worst <= residual / 2 < np.inf
+
+    def _merit(self, point: Point) -> float:
+        """Cost and penalties on all violations, whoever is supposed to yield."""
+        merit = self._step.merit(point.cost, 0.0, point.excess)
+        if point.pushed is not None:
+            merit += self._weight * float(np.maximum(0.0, -point.pushed.tangent.g).sum())
+        return merit
+
+    def _shrink(self, point: Point, held: Held) -> None:
+        """Trust only a part of the way that the inputs were to go."""
+        c, chart = self._step.layout, self._step.chart
+        change = (chart.y(held.v)[c.u] - point.y[c.u]).reshape(c.shape) / self._span
+        self._radius = _SHRINK * min(self._radius, float(np.abs(change).max()))
