@@ -23,6 +23,7 @@ Notation:
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -43,6 +44,8 @@ from scp_mpc.robots.model import Model
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
 from scp_mpc.safety.margin import Containment, Margin, Promise, size_at
 from scp_mpc.settings import require_positive
+
+ROUNDING = 1e-9  # [unit of the input] by which a rate may exceed its bounds
 
 _INFLATIONS: dict[str, type[Inflation]] = {"exact": ExactInflation, "axes": AxesInflation}
 
@@ -206,6 +209,36 @@ class Problem:
     def limits_rates(self) -> bool:
         """Whether any input's change per interval has a finite bound."""
         return bool(np.isfinite(self.du_min).any() or np.isfinite(self.du_max).any())
+
+    def reach(self, u_last: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return what rates allow of the first input after u_last (nu,): (nu,) lower and upper.
+
+        Infinite where rates are not bounded, and where u_last is None, unknown. Where an input was
+        so far outside its bounds that no rate leads back, its rate gives way: the bound itself is
+        the one value allowed.
+        """
+        if u_last is None:
+            return np.full(self.model.nu, -np.inf), np.full(self.model.nu, np.inf)
+        lower = np.minimum(u_last + self.du_min, self.u_max)
+        return lower, np.maximum(u_last + self.du_max, self.u_min)
+
+    def limited(self, inputs: FloatArray, u_last: FloatArray | None = None) -> FloatArray:
+        """Return inputs (N, nu), the first after u_last (nu,), moved into all their bounds.
+
+        One after the other, each as little as the one before allows; inputs whose later changes
+        exceed their bounds by rounding alone are kept.
+        """
+        u = np.minimum(np.maximum(inputs, self.u_min), self.u_max)
+        if not self.limits_rates:
+            return u
+        reached = np.clip(u[0], *self.reach(u_last))
+        u[0] = np.clip(reached, self.u_min, self.u_max)
+        change = np.diff(u, axis=0)
+        if (change > self.du_max + ROUNDING).any() or (change < self.du_min - ROUNDING).any():
+            for before, now in pairwise(u):
+                reached = np.clip(now, before + self.du_min, before + self.du_max)
+                now[:] = np.clip(reached, self.u_min, self.u_max)
+        return u
 
     def excess(self, states: FloatArray) -> FloatArray:
         """Return by how much states (N+1, nx) are outside their bounds at stages 1 .. N (N, nx)."""

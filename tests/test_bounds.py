@@ -1,12 +1,29 @@
 """Bounds of the states, which give way at a price, and of the inputs' rates, which do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from instances import problem
+from driving import same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import problem, straight_reference
 
-from scp_mpc import BoundsError, InvalidArgumentError, NotFiniteError, ShapeError
+from scp_mpc import (
+    MPC,
+    SCP,
+    BoundsError,
+    InvalidArgumentError,
+    Iterate,
+    NotFiniteError,
+    Settings,
+    ShapeError,
+)
+from scp_mpc.solver import Multipliers
 
 NAN, INF = np.nan, np.inf
+N = 8
+SPARSE = Settings(condense=False)
 
 
 @pytest.mark.parametrize(
@@ -70,3 +87,98 @@ def test_the_excess_is_what_is_outside_the_bounds_from_stage_one():
     np.testing.assert_array_equal(this.excess(states), expected)
     slack = np.array([[0.25, 0.5]])
     assert this.penalty(slack, states) == pytest.approx(1e3 * 0.75 + 100.0 * 4.5)
+
+
+@pytest.mark.parametrize(
+    ("u_last", "lower", "upper"),
+    [
+        ([0.0, 0.0], [-0.5, -INF], [1.0, 0.25]),
+        ([3.0, -3.0], [2.5, -INF], [4.0, -2.75]),
+        ([3.2, -3.1], [2.7, -INF], [4.2, -2.85]),  # outside, but not for long
+        ([9.0, -9.0], [3.0, -INF], [10.0, -3.0]),  # so far outside that the rate gives way
+        ([-9.0, 9.0], [-9.5, -INF], [-3.0, 9.25]),
+        (None, [-INF, -INF], [INF, INF]),
+    ],
+)
+def test_what_rates_allow_of_the_first_input(u_last, lower, upper):
+    this = problem(N, du_min=[-0.5, -INF], du_max=[1.0, 0.25])
+    reached = this.reach(None if u_last is None else np.array(u_last))
+    np.testing.assert_allclose(reached, [lower, upper], rtol=1e-15)
+
+
+numbers = st.floats(-10.0, 10.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    inputs=st.lists(st.tuples(numbers, numbers), min_size=N, max_size=N),
+    u_last=st.none() | st.tuples(numbers, numbers),
+    steps=st.tuples(*[st.floats(0.0, 4.0) | st.just(INF)] * 4),
+)
+def test_limited_inputs_keep_all_bounds_and_change_no_more_than_they_must(inputs, u_last, steps):
+    this = problem(N, u_min=[-1.0, -3.0], du_min=np.negative(steps[:2]), du_max=steps[2:])
+    U, last = np.array(inputs), None if u_last is None else np.array(u_last)
+    before = U.copy()
+    V = this.limited(U, last)
+    np.testing.assert_array_equal(U, before)
+    assert (this.u_min <= V).all()
+    assert (this.u_max >= V).all()
+    change = np.diff(V, axis=0)
+    assert (change <= this.du_max + 1e-9).all()
+    assert (change >= this.du_min - 1e-9).all()
+    low, high = this.reach(last)
+    room = np.clip([low, high], this.u_min, this.u_max)
+    assert (room[0] <= V[0]).all()
+    assert (room[1] >= V[0]).all()
+    np.testing.assert_array_equal(V[0], np.clip(U[0], *room))
+    np.testing.assert_array_equal(this.limited(V, last), V)
+
+
+def test_multipliers_of_bounds_move_with_their_stage_and_need_not_be_there():
+    rng = np.random.default_rng(0)
+    shapes = (N, 4), (N, 2), (1,), (1, N), (1, N), (N, 3), (N, 2)
+    duals = Multipliers(*(rng.normal(size=shape) for shape in shapes))
+    later = [*range(1, N), N - 1]
+    for old, new in ((duals, duals.shifted()), (duals, duals.resampled(4).shifted())):
+        np.testing.assert_array_equal(new.states, old.states[later])
+        np.testing.assert_array_equal(new.rates, old.rates[later])
+    bare = Multipliers(*list(vars(duals).values())[:5])
+    assert bare.shifted().states.size == bare.shifted().rates.size == 0
+
+
+def test_a_guess_brings_the_multipliers_of_all_bounds_or_none():
+    this, ref = problem(N, x_max=[INF, 2.0, INF, 2.0], du_max=1.0), straight_reference(N)
+    zeros = [np.zeros(shape) for shape in ((N, 4), (N, 2), (1,), (1, N), (1, N))]
+    guess = Iterate(ref, np.zeros((N, 2)), np.ones(1), np.zeros((1, N)), Multipliers(*zeros))
+    solver = SCP(this, SPARSE)
+    solver.solve(ref[0], ref, [], guess)
+    for name, columns in (("states", 4), ("rates", 3)):
+        duals = replace(guess.multipliers, **{name: np.zeros((N, columns))})
+        with pytest.raises(ShapeError, match=rf"guess.{name}: shape \({N}, {columns}\)"):
+            solver.solve(ref[0], ref, [], replace(guess, multipliers=duals))
+
+
+@pytest.mark.parametrize(
+    ("u_last", "error"),
+    [
+        ([0.0], ShapeError),
+        (0.0, ShapeError),
+        ([0.0, NAN], NotFiniteError),
+        ([INF, 0.0], NotFiniteError),
+        ("full", InvalidArgumentError),
+    ],
+)
+@pytest.mark.parametrize("changes", [{}, {"du_max": 0.5, "x_max": 3.0}])
+def test_a_bad_last_input_is_refused_and_leaves_no_trace(u_last, error, changes):
+    ref = straight_reference(N)
+    plans = []
+    for disturbed in (False, True):
+        mpc = MPC(problem(N, **changes), SPARSE)
+        for k in range(3):
+            if disturbed:
+                with pytest.raises(error, match="u_last"):
+                    mpc.step(ref[k], ref, u_last=u_last)
+            plans.append(mpc.step(ref[k], ref + [0, 0, 0.1, 0]))
+    assert same(plans[:3], plans[3:])
+    with pytest.raises(error, match="u_last"):
+        SCP(problem(N, **changes), SPARSE).solve(ref[0], ref, u_last=u_last)

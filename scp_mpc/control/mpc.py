@@ -3,7 +3,7 @@
 what is known of the obstacles now: reports brought up to the present, vanished ones kept
 nominal = previous plan, shifted
 plan = SCP (or braking, where a report is too old)
-u0 within its bounds, checked last; only then is anything remembered
+u0 within its bounds and a rate's reach, checked last; only then is anything remembered
 """
 
 import logging
@@ -15,11 +15,11 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import frozen
+from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.memory import ObstacleMemory, Recall
 from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.problem import Problem
+from scp_mpc.problem import ROUNDING, Problem
 from scp_mpc.settings import Settings
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Plan, Status
@@ -53,6 +53,7 @@ class MPC:
 
     def _forget(self) -> None:
         self._last: Iterate | None = None
+        self._applied: FloatArray | None = None
         self._steps_touching = 0
         self._obstacles: tuple[ObstaclePrediction, ...] = ()
         self._counts.clear()
@@ -94,6 +95,7 @@ class MPC:
         *,
         time: float | None = None,
         robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
     ) -> Plan:
         """Return the plan for this control step; apply `plan.u0`.
 
@@ -106,6 +108,9 @@ class MPC:
             time: Now [s], on the clock of the predictions' stamps; None for one interval after the
                 last step that returned a plan, or 0 at the first.
             robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2].
+            u_last: (nu,) input last applied, from which the first rate counts. None for `u0` of the
+                last plan that this controller returned; at the first step, and at the first after
+                `reset`, for unknown: then the first input has no rate.
 
         Raises:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
@@ -115,10 +120,13 @@ class MPC:
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)
-            plan = self._plan(x0, x_ref, recall, robot_covariance, watch)
-            sound = self._within(plan)
+            last = self._applied if self.problem.limits_rates else None
+            if u_last is not None:
+                last = as_array("u_last", u_last, (self.problem.model.nu,))
+            plan = self._plan(x0, x_ref, recall, robot_covariance, watch, last)
+            sound = self._within(plan, last)
             if not sound:
-                plan = self._bounded(plan, x0, x_ref)
+                plan = self._bounded(plan, x0, x_ref, last)
             self._memory.commit(recall)
             self._keep(plan, recall, plan.iterate if sound else None)
             return plan
@@ -150,33 +158,40 @@ class MPC:
         recall: Recall,
         robot_covariance: ArrayLike | None,
         watch: Stopwatch,
+        last: FloatArray | None,
     ) -> Plan:
         if recall.stale is None:
             challenge = self._steps_touching % self.settings.sides_interval == 0
             shifted = None if self._last is None else self._shifted
             return self._solver.solve_from(
-                x0, x_ref, recall.obstacles, shifted, challenge, robot_covariance, watch
+                x0, x_ref, recall.obstacles, shifted, challenge, robot_covariance, watch, last
             )
         if self.settings.freshness.beyond == "refuse":
             raise recall.stale
         # Bad arguments are refused before the robot brakes.
         StepData.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
         _log.warning("%s: braking", recall.stale)
-        return self._solver.brake(x0, x_ref, Status.STALE)
+        return self._solver.brake(x0, x_ref, Status.STALE, last)
 
-    def _within(self, plan: Plan) -> bool:
+    def _within(self, plan: Plan, last: FloatArray | None) -> bool:
         lower, upper = self.problem.u_min, self.problem.u_max
-        return bool(((lower <= plan.u0) & (plan.u0 <= upper)).all())  # False for NaN
+        within = (lower <= plan.u0) & (plan.u0 <= upper)  # False for NaN
+        if self.problem.limits_rates:
+            lower, upper = self.problem.reach(last)
+            within &= (lower - ROUNDING <= plan.u0) & (plan.u0 <= upper + ROUNDING)
+        return bool(within.all())
 
-    def _bounded(self, plan: Plan, x0: ArrayLike, x_ref: ArrayLike) -> Plan:
+    def _bounded(
+        self, plan: Plan, x0: ArrayLike, x_ref: ArrayLike, last: FloatArray | None
+    ) -> Plan:
         """The last guard: brake instead of an input that must not be applied."""
         lower, upper = self.problem.u_min, self.problem.u_max
-        _log.error("input %s is outside [%s, %s]: braking", plan.u0, lower, upper)
-        plan = self._solver.brake(x0, x_ref, Status.FALLBACK)
-        return replace(plan, U=frozen(np.clip(np.nan_to_num(plan.U), lower, upper)))
+        _log.error("input %s is outside [%s, %s] or its rates: braking", plan.u0, lower, upper)
+        plan = self._solver.brake(x0, x_ref, Status.FALLBACK, last)
+        return replace(plan, U=frozen(self.problem.limited(np.nan_to_num(plan.U), last)))
 
     def _keep(self, plan: Plan, recall: Recall, start: Iterate | None) -> None:
-        self._last = start
+        self._last, self._applied = start, plan.u0
         self._obstacles = recall.obstacles
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
         self._counts[plan.status] += 1

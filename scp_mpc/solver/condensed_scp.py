@@ -249,8 +249,7 @@ class CondensedSCP:
         c, duals = self._layout, nominal.multipliers
         active = np.zeros(c.size - c.boxed.start, dtype=np.intp)
         if duals is not None:
-            parts = [duals.inputs.ravel(), duals.rates.ravel(), duals.states.ravel()]
-            forces = np.concatenate([duals.margin[: c.moving], *parts])
+            forces = c.gathered(duals.margin, duals.inputs, duals.rates, duals.states)
             active[forces < -NEGLIGIBLE], active[forces > NEGLIGIBLE] = -1, 1
         return active
 

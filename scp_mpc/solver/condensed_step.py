@@ -108,7 +108,7 @@ class CondensedStep:
     ) -> tuple[FloatArray, Rolled]:
         """Clip inputs (N, nu) and sizes (M,) to their bounds and roll out; return y, and how."""
         problem, size = self.problem, self.problem.size
-        inputs = np.minimum(np.maximum(inputs, problem.u_min), problem.u_max)
+        inputs = problem.limited(inputs, self.data.u_last)
         s = np.minimum(np.maximum(s, size.lower), size.upper)
         rolled = self.condensed.rolled(inputs, guess)
         y = self.layout.outputs(self.data, rolled.positions, s, inputs, rolled.deviations)

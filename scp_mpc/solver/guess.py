@@ -31,6 +31,10 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
     if guess.multipliers is not None:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}
         _check(guess.multipliers, {**shapes, "obstacles": (M, points), "slack": (M, points)})
+        if guess.multipliers.states.size:
+            _check(guess.multipliers, {"states": (N, len(problem.bounded_states))})
+        if guess.multipliers.rates.size:
+            _check(guess.multipliers, {"rates": (N, model.nu)})
     return guess
 
 

@@ -4,6 +4,7 @@ Notation:
     X (N+1, nx)     states              s       (M,)    sizes of the ellipsoids
     U (N, nu)       inputs              slack   (M, C)  violation per obstacle and point [m]
     C               points at which obstacles are constrained: N, or K in each of N intervals
+    nb              states with a finite bound, `Problem.bounded_states`
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,8 +27,9 @@ class Multipliers:
         margin: (M,) of the bounds on s.
         obstacles: (M, C) of the obstacles' constraints, never positive.
         slack: (M, C) of slack = 0, or of slack >= 0 where it is free.
-        states: (N, nb) of the bounds on states; empty where there are none.
-        rates: (N, nu) of the bounds on the inputs' changes; likewise.
+        states: (N, nb) of the bounds of states, at most `Problem.state_slack_weight`; empty where
+            the problem has none, or where they are unknown.
+        rates: (N, nu) of the bounds of u_i - u_{i-1}; empty likewise.
     """
 
     dynamics: FloatArray

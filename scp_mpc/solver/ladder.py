@@ -60,15 +60,14 @@ class Ladder:
 
     def keep(self, step: StepData, inputs: FloatArray) -> Descent:
         """Roll the last plan's inputs (N, nu) out from the state now."""
-        problem = self._problem
-        return self._judged(step, np.clip(inputs, problem.u_min, problem.u_max), Status.PREVIOUS)
+        return self._judged(step, self._problem.limited(inputs, step.u_last), Status.PREVIOUS)
 
     def brake(self, step: StepData, status: Status = Status.BRAKING) -> Descent:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
         problem, model, x = self._problem, self._problem.model, step.x0
         rest = np.clip(model.idle, problem.u_min, problem.u_max)
         most, least = problem.u_max - rest, problem.u_min - rest
-        U = np.tile(rest, (problem.horizon, 1))
+        U, last = np.tile(rest, (problem.horizon, 1)), step.u_last
         for u in U:
             wanted = model.brake(x) - rest
             if float(np.abs(wanted).max()) <= _AT_REST:
@@ -79,8 +78,9 @@ class Ladder:
             none = np.abs(room) <= _AT_REST
             wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
             u += wanted / max(1.0, float((wanted / room).max()))
+            u[:] = last = problem.limited(u[None], last)[0]
             x = model.step(x, u)
-        return self._judged(step, np.clip(U, problem.u_min, problem.u_max), status)
+        return self._judged(step, problem.limited(U, step.u_last), status)
 
     def _judged(self, step: StepData, inputs: FloatArray, status: Status) -> Descent:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""

@@ -57,9 +57,12 @@ class Layout:
         if self.size == self.u.stop:
             return self._lower, self._upper
         lower, upper = self._lower.copy(), self._upper.copy()
-        if self._rates and step.u_last is None:
+        if self._rates:
             first = slice(self.du.start, self.du.start + self.shape[1])
-            lower[first], upper[first] = -_NONE, _NONE
+            least, most = self._problem.reach(step.u_last)
+            last = 0.0 if step.u_last is None else step.u_last
+            lower[first] = np.maximum(least - last, -_NONE)
+            upper[first] = np.minimum(most - last, _NONE)
         if len(self._states):
             reference = step.x_ref[1:, self._states]
             least = self._problem.x_min[self._states] - reference
@@ -128,6 +131,16 @@ class Layout:
             du.reshape(N, nu) if len(du) else empty,
             z.reshape(N, -1) if len(z) else empty,
         )
+
+    def gathered(self, s: FloatArray, u: FloatArray, du: FloatArray, z: FloatArray) -> FloatArray:
+        """The inverse of `parted`; empty arrays stand for zeros."""
+        forces = np.zeros(self.size - self.boxed.start)
+        forces[: self.moving], forces[self.inputs] = s[: self.moving], u.ravel()
+        if du.size:
+            forces[self.inputs.stop : self.yielding.start] = du.ravel()
+        if z.size:
+            forces[self.yielding] = z.ravel()
+        return forces
 
     def pushed(self, reaction: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """What forces (nf,) on the boxed entries do: (N, nx) on e, or None, and (N, nu) on u."""

@@ -75,6 +75,7 @@ class Plan:
         s: (M,) sizes of the obstacles' ellipsoids; where a risk is promised, see `risk` instead.
         slack: (M, N) violation of each obstacle's constraint at stages 1 .. N, or between a stage
             and the one before [m].
+        x_slack: (N, nx) by how much the states at stages 1 .. N are outside their bounds.
         cost: Value of the objective, slack not included.
         status: How it ended.
         kkt: Residuals of the original problem's KKT conditions at this plan.
@@ -92,6 +93,7 @@ class Plan:
     U: FloatArray
     s: FloatArray
     slack: FloatArray
+    x_slack: FloatArray
     cost: float
     status: Status
     kkt: KKTResiduals

@@ -74,6 +74,7 @@ class SCP:
         guess: Trajectory | Iterate | None = None,
         challenge: bool = True,
         robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
     ) -> Plan:
         """Plan from the state x0 along the reference and around the obstacles.
 
@@ -85,6 +86,8 @@ class SCP:
             challenge: Try the other sides even if this one works, unless `settings.sides` is off.
             robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2]; adds to the
                 obstacles'.
+            u_last: (nu,) input last applied, from which the first rate counts. None for unknown:
+                then the first input has no rate.
 
         Raises:
             InvalidArgumentError: Or one of its subclasses, before anything is changed.
@@ -92,7 +95,9 @@ class SCP:
         """
         nominal = None if guess is None else as_iterate(guess, self.problem)
         shifted = None if nominal is None else lambda: nominal
-        return self.solve_from(x0, x_ref, obstacles, shifted, challenge, robot_covariance)
+        return self.solve_from(
+            x0, x_ref, obstacles, shifted, challenge, robot_covariance, u_last=u_last
+        )
 
     def solve_from(
         self,
@@ -103,6 +108,7 @@ class SCP:
         challenge: bool,
         robot_covariance: ArrayLike | None = None,
         watch: Stopwatch | None = None,
+        u_last: ArrayLike | None = None,
     ) -> Plan:
         """`solve`, with a nominal plan made only where it is needed, and a clock that may run."""
         if not self._busy.acquire(blocking=False):
@@ -110,7 +116,9 @@ class SCP:
         try:
             watch = self.stopwatch() if watch is None else watch
             sampling = self._resolution.coarse.sampling
-            step = StepData.read(self.problem, x0, x_ref, obstacles, robot_covariance, sampling)
+            step = StepData.read(
+                self.problem, x0, x_ref, obstacles, robot_covariance, sampling, u_last
+            )
             try:
                 return self._solve(step, watch, nominal, challenge)
             except (ArithmeticError, np.linalg.LinAlgError):
@@ -121,10 +129,16 @@ class SCP:
         finally:
             self._busy.release()
 
-    def brake(self, x0: ArrayLike, x_ref: ArrayLike, status: Status = Status.BRAKING) -> Plan:
+    def brake(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        status: Status = Status.BRAKING,
+        u_last: ArrayLike | None = None,
+    ) -> Plan:
         """Bring the robot to rest at the model's limits, whatever is in the way."""
         watch = Stopwatch()
-        step = StepData.read(self.problem, x0, x_ref, ())
+        step = StepData.read(self.problem, x0, x_ref, (), u_last=u_last)
         found = Found(self._ladder.brake(step, status))
         return self._plan(step, found, watch, {})
 
@@ -211,6 +225,7 @@ class SCP:
             U=iterate.inputs,
             s=iterate.s[: step.count],
             slack=slack,
+            x_slack=frozen(self.problem.excess(iterate.states)),
             cost=best.cost,
             status=best.status,
             kkt=best.residuals,

@@ -39,6 +39,7 @@ class StepData:
         radii: (J, C) sums of the radii, or more where gaps between points ask for it [m].
         robot_covariance: (N+1, d, d) of the robot's own position [m^2], or None.
         scale: (J, C) what multiplies the standard deviations: sizes over s_ref; or None for one.
+        u_last: (nu,) input last applied, from which the first rate counts; None for unknown.
     """
 
     problem: Problem
@@ -61,6 +62,7 @@ class StepData:
         obstacles: Sequence[ObstaclePrediction],
         robot_covariance: ArrayLike | None = None,
         sampling: Sampling | None = None,
+        u_last: ArrayLike | None = None,
     ) -> "StepData":
         """Check everything and stack the predictions, as they are at the samples.
 
@@ -87,12 +89,14 @@ class StepData:
             uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
             uncertain = np.broadcast_to(uncertain, (N + 1, *shape))
             require_positive_semidefinite("robot_covariance", uncertain)
+        last = None if u_last is None else as_array("u_last", u_last, (model.nu,))
         sampling = Sampling.of(problem, 1) if sampling is None else sampling
         means = np.array([o.means for o in obstacles]).reshape(-1, N + 1, model.dim)
         radii = problem.robot_radius + np.array([o.radius for o in obstacles])
         radii = np.repeat(radii[:, None], sampling.points, axis=1)
         means = sampling.interpolated(means)
-        step = cls(problem, state, reference, obstacles, sampling, means, radii, uncertain)
+        given = problem, state, reference, obstacles, sampling, means, radii, uncertain
+        step = cls(*given, u_last=last)
         return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
 
     @property
