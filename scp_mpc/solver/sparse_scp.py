@@ -66,7 +66,7 @@ class SparseSCP:
             self._stale = False
         self.step, self.watch = step, watch
         self._qp.reset_counts()
-        self._subproblem.write_step(step.x0, step.x_ref)
+        self._subproblem.write_step(step.x0, step.x_ref, step.u_last)
 
     def widen(self, step: StepData) -> None:
         """Take other radii or sizes for the step that has begun."""
@@ -184,7 +184,9 @@ class SparseSCP:
         if residuals.worst > self._settings.tolerance:  # the slack is about the last nominal
             iterate = replace(iterate, slack=self._depths)
             residuals = self._subproblem.residuals(iterate)
-        status = judge(residuals, iterate.slack.max(initial=0.0), self._settings.tolerance)
+        excess = self._problem.excess(iterate.states).max()
+        most = float(np.maximum(iterate.slack.max(initial=0.0), excess))  # NaN stays
+        status = judge(residuals, most, self._settings.tolerance)
         cost = self._cost(iterate)
         merit = cost + self._penalty(iterate)
         return Descent(iterate.frozen, cost, merit, residuals, status, iterations)
@@ -193,7 +195,7 @@ class SparseSCP:
         return self._cost(iterate) + self._penalty(iterate)
 
     def _penalty(self, iterate: Iterate) -> float:
-        return self._problem.slack_weight * float(iterate.slack.sum())
+        return self._problem.penalty(iterate.slack, iterate.states)
 
     def _cost(self, iterate: Iterate) -> float:
         return self._problem.cost(iterate.states, iterate.inputs, iterate.s, self.step.x_ref)

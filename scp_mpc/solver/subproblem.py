@@ -3,13 +3,14 @@
 Notation:
     e_i = x_i - xref_i      deviation from the reference, so that no number depends on the origin
     C                       points at which obstacles are constrained, K in each interval
-    z = [e_1 .. e_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MC]
-    rows = [dynamics | input bounds | bounds on s | half-spaces | slack]
+    z = [e_1 .. e_N | u_0 .. u_{N-1} | s_1 .. s_M | slack_11 .. slack_MC | excess]
+    rows = [dynamics | input bounds | bounds on s | half-spaces | slack | limits]
 
     dynamics        e_{i+1} - A e_i - B u_i = A xref_i - xref_{i+1}, with A x_0 for A (e_0 + xref_0)
     half-spaces     normal_jc' p_c + slope_jc s_j + slack_jc >= offset_jc - normal_jc' track_c
                         with p_c = e_i[position] at the samples, else C_k e_i + D_k u_i
     slack           slack = 0 (firm) or slack >= 0 at `slack_weight` per metre (soft)
+    limits, excess  bounds of states and rates, where there are any: `limits.py`
 
 OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w, 0).
 """
@@ -24,6 +25,7 @@ from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.solver.iterate import Iterate, Multipliers
+from scp_mpc.solver.limits import Limits
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
 from scp_mpc.solver.sampling import LinearSampling, Sampling
 from scp_mpc.solver.sparse_blocks import SparseBlocks
@@ -51,7 +53,9 @@ class Subproblem:
         rows = [N * model.nx, N * model.nu, M, M * C, M * C]
         self._x, self._u, self._s, self._slack = _slices(columns)
         self._dynamics, self._inputs, self._margin, self._spaces, self._pins = _slices(rows)
-        n, m = sum(columns), sum(rows)
+        self._limits = Limits(problem)
+        self._limits.place(sum(columns), sum(rows))
+        n, m = sum(columns) + self._limits.columns, sum(rows) + self._limits.rows
         A, self._places = self._constraints((m, n))
         self.program = QuadraticProgram(
             self._hessian(), np.zeros(n), A, np.full(m, -np.inf), np.full(m, np.inf)
@@ -61,6 +65,7 @@ class Subproblem:
         upper[self._inputs] = np.tile(problem.u_max, N)
         lower[self._margin], upper[self._margin] = problem.size.lower, problem.size.upper
         lower[self._pins] = 0.0
+        self._limits.write_constants(self.program)
         self.program.q[self._s] = -2 * problem.size.weight * problem.size.reference
         self._x0 = np.zeros(model.nx)
         self._reference = np.zeros((N, model.nx))
@@ -78,9 +83,12 @@ class Subproblem:
         self.program.upper[self._pins] = np.inf if soft else 0.0
         self.program.q[self._slack] = self._problem.slack_weight if soft else 0.0
 
-    def write_step(self, x0: FloatArray, x_ref: FloatArray) -> None:
-        """Write the state x0 (nx,) and the reference x_ref (N+1, nx) of a control step."""
-        self._x0, self._reference = x0, x_ref[1:]
+    def write_step(
+        self, x0: FloatArray, x_ref: FloatArray, u_last: FloatArray | None = None
+    ) -> None:
+        """Write a control step: state x0 (nx,), reference x_ref (N+1, nx), input before (nu,)."""
+        self._x0, self._reference, self._u_last = x0, x_ref[1:], u_last
+        self._limits.write_step(self.program, self._reference, u_last)
         before = np.concatenate([x0[None], x_ref[1:-1]])
         drift = before @ self._model.A.T - x_ref[1:]
         self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = drift.ravel()
@@ -106,10 +114,11 @@ class Subproblem:
     def pack(self, iterate: Iterate) -> tuple[FloatArray, FloatArray]:
         """Flatten an iterate into z and y; missing multipliers are zero."""
         deviations = iterate.states[1:] - self._reference
-        z = np.concatenate(
+        z, y = np.zeros(len(self.program.q)), np.zeros(len(self.program.lower))
+        z[: self._slack.stop] = np.concatenate(
             [deviations.ravel(), iterate.inputs.ravel(), iterate.s, iterate.slack.ravel()]
         )
-        y = np.zeros(len(self.program.lower))
+        self._limits.pack(iterate, z, y)
         if iterate.multipliers is not None:
             duals = iterate.multipliers
             y[self._dynamics] = duals.dynamics.ravel()
@@ -120,14 +129,14 @@ class Subproblem:
         return z, y
 
     def unpack(self, z: FloatArray, y: FloatArray) -> Iterate:
-        """Name the parts of z and y; inputs and sizes are clipped to their bounds."""
+        """Name the parts of z and y; inputs and sizes are moved into their bounds."""
         problem = self._problem
         N, model = problem.horizon, problem.model
         slots = problem.max_obstacles, self._sampling.points
         y.setflags(write=False)
         return Iterate(
             np.concatenate([self._x0[None], self._reference + z[self._x].reshape(N, model.nx)]),
-            np.clip(z[self._u].reshape(N, model.nu), problem.u_min, problem.u_max),
+            problem.limited(z[self._u].reshape(N, model.nu), self._u_last),
             np.clip(z[self._s], problem.size.lower, problem.size.upper),
             np.maximum(z[self._slack].reshape(slots), 0.0),
             Multipliers(
@@ -136,6 +145,7 @@ class Subproblem:
                 y[self._margin],
                 y[self._spaces].reshape(slots),
                 y[self._pins].reshape(slots),
+                *self._limits.unpack(y),
             ),
         )
 
@@ -167,7 +177,7 @@ class Subproblem:
         weights = [problem.Q] * (N - 1) + [problem.Qf] + [problem.R] * N
         blocks = [sparse.csc_matrix(2 * block) for block in weights]  # without the blocks' zeros
         blocks.append(2 * problem.size.weight * sparse.eye(M, format="csc"))
-        blocks.append(sparse.csc_matrix((M * self._sampling.points,) * 2))
+        blocks.append(sparse.csc_matrix((M * self._sampling.points + self._limits.columns,) * 2))
         return sparse.csc_matrix(sparse.block_diag(blocks, format="csc"))
 
     def _constraints(self, shape: tuple[int, int]) -> tuple[sparse.csc_matrix, dict[str, IntArray]]:
@@ -197,6 +207,7 @@ class Subproblem:
         if K > 1:
             blocks.add("along states", space[:, 1:, :-1], state[:-1], 0.0)
             blocks.add("along inputs", space[:, :, :-1], control, 0.0)
+        self._limits.add(blocks, state[:, 0], control[:, 0])
         return blocks.build(shape)
 
 
