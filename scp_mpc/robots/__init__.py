@@ -13,3 +13,6 @@ __all__ = [
     "NonlinearModel",
     "Unicycle",
 ]
+from scp_mpc.robots.riccati import lqr_gain, lqr_preview, lqr_weight
+
+__all__ = ["DoubleIntegrator", "LinearModel", "lqr_gain", "lqr_preview", "lqr_weight"]
