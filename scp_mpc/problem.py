@@ -41,6 +41,7 @@ from scp_mpc.arrays import (
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
 from scp_mpc.robots.model import Model
+from scp_mpc.robots.riccati import terminal_weight
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
 from scp_mpc.safety.margin import Containment, Margin, Promise, size_at
 from scp_mpc.settings import require_positive
@@ -61,7 +62,8 @@ class Problem:
         R: Input weight (nu,) or (nu, nu), positive semi-definite.
         u_min: Lower input bounds, a number or (nu,).
         u_max: Upper input bounds, a number or (nu,).
-        Qf: Weight of the last state; Q if None.
+        Qf: Weight of the last state; Q if None. "lqr": the solution of the Riccati equation, which
+            is the cost of all that follows where no constraint is active beyond the horizon.
         robot_radius: Radius of the robot [m].
         margin: The obstacles' sizes s_j: a `Margin` that may give way, or a promise that does not,
             `StageRisk`, `JointRisk` or `Containment`. None: 95 % containment, in the plane as the
@@ -118,7 +120,7 @@ class Problem:
         R: ArrayLike,
         u_min: ArrayLike,
         u_max: ArrayLike,
-        Qf: ArrayLike | None = None,
+        Qf: ArrayLike | Literal["lqr"] | None = None,
         robot_radius: float = 0.0,
         margin: Promise | None = None,
         inflation: Literal["exact", "axes"] = "exact",
@@ -154,11 +156,14 @@ class Problem:
             margin = Margin() if model.dim == 2 else Containment(0.95)
         if not isinstance(margin, Promise):
             raise InvalidArgumentError("margin", f"{margin!r} is no Margin, risk or Containment")
+        weights = as_weight("Q", Q, model.nx), as_weight("R", R, model.nu)
+        if isinstance(Qf, str) and Qf == "lqr":
+            Qf = terminal_weight(model, *weights)
         values = {
             "model": model,
             "horizon": horizon,
-            "Q": as_weight("Q", Q, model.nx),
-            "R": as_weight("R", R, model.nu),
+            "Q": weights[0],
+            "R": weights[1],
             "Qf": as_weight("Qf", Q if Qf is None else Qf, model.nx),
             "u_min": lower,
             "u_max": upper,
