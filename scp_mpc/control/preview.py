@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, as_array, as_count
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
 from scp_mpc.robots.riccati import lqr_preview
 
 
@@ -38,6 +39,9 @@ class Preview:
         """Solve the Riccati equation and take the closed loop to its powers."""
         self._problem, self._rows = problem, as_count("rows", rows)
         model = problem.model
+        if not isinstance(model, LinearModel):
+            raise InvalidArgumentError("problem", f"{type(model).__name__} is not linear")
+        self._A = model.A
         S, self._moves = lqr_preview(model.A, model.B, problem.Q, problem.R, self._rows)
         away = float(np.abs(problem.Qf - S).max())
         if away > 1e-9 * np.abs(S).max():
@@ -54,9 +58,9 @@ class Preview:
             ShapeError: The reference is not N + 1 + L rows long.
             NotFiniteError: NaN or infinity.
         """
-        N, model = self._problem.horizon, self._problem.model
-        rows = as_array("x_ref", x_ref, (N + 1 + self._rows, model.nx))
-        w = rows[N:-1] @ model.A.T - rows[N + 1 :]
+        N = self._problem.horizon
+        rows = as_array("x_ref", x_ref, (N + 1 + self._rows, len(self._A)))
+        w = rows[N:-1] @ self._A.T - rows[N + 1 :]
         folded = rows[: N + 1].copy()
         folded[N] -= np.einsum("jkl,jl->k", self._moves, w)
         return folded
