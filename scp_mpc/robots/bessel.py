@@ -3,7 +3,7 @@
 Notation:
     mu      half the angle turned, any sign
     j_n     (1/2) integral over [-1, 1] of exp(i mu t) P_n(t) dt = i^n j_n(mu)
-    k_n     j_n / mu^n, even in mu and entire: Horner's scheme in mu^2 has no 0/0
+    k_n     j_n / mu^n, even in mu and entire: its power series has no 0/0
 
 Source: NIST Digital Library of Mathematical Functions, 10.51 and 10.53.
 """
@@ -15,12 +15,12 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 
 _NARROW = 0.5
-# the coefficients of k_2 and k_3; eight reach rounding errors where mu^2 <= _NARROW
-_LAST, *_SERIES = (
-    np.array(
-        [[(-0.5) ** k / (factorial(k) * prod(range(1, 2 * n + 2 * k + 2, 2)))] for n in (2, 3)]
-    )
-    for k in range(7, -1, -1)
+# coefficients of k_0 .. k_3 in powers of mu^2: eight reach rounding errors up to _NARROW
+_SERIES = np.array(
+    [
+        [(-0.5) ** k / (factorial(k) * prod(range(1, 2 * n + 2 * k + 2, 2))) for k in range(8)]
+        for n in range(4)
+    ]
 )
 
 
@@ -29,28 +29,22 @@ def bessel(mu: FloatArray) -> FloatArray:
     shape, mu = np.shape(mu), np.reshape(mu, -1)
     square = mu * mu
     wide = square.max(initial=0.0) > _NARROW
-    m = np.minimum(square, _NARROW) if wide else square
-    k = m * _LAST
-    for coefficient in _SERIES[:-1]:
-        k += coefficient
-        k *= m
-    k += _SERIES[-1]
-    k2, k3 = k
-    # downwards the recurrence j_(n-1) = (2n+1)/mu j_n - j_(n+1) is stable
-    j0, j1, j2, j3 = j = np.empty((4, len(mu)))
-    k1 = 5.0 * k2 - square * k3
-    np.multiply(mu, k1, out=j1)
-    np.multiply(square, k2, out=j2)
-    np.multiply(square * mu, k3, out=j3)
-    np.subtract(3.0 * k1, j2, out=j0)
+    powers = np.empty((8, len(mu)))
+    powers[0] = 1.0
+    powers[1] = np.minimum(square, _NARROW) if wide else square
+    np.multiply(powers[:2], powers[1] * powers[1], out=powers[2:4])
+    np.multiply(powers[:4], powers[2] * powers[2], out=powers[4:])
+    j: FloatArray = _SERIES @ powers
+    j[1::2] *= mu
+    j[2:] *= square
     if wide:
-        # and upwards where mu is not small
+        # the recurrence j_(n+1) = (2n+1)/mu j_n - j_(n-1) is stable where mu is not small
         far = square > _NARROW
         x = mu[far]
-        j0[far] = np.sin(x) / x
-        j1[far] = (j0[far] - np.cos(x)) / x
-        j2[far] = 3 * j1[far] / x - j0[far]
-        j3[far] = 5 * j2[far] / x - j1[far]
+        j[0, far] = np.sin(x) / x
+        j[1, far] = (j[0, far] - np.cos(x)) / x
+        for n in (1, 2):
+            j[n + 1, far] = (2 * n + 1) / x * j[n, far] - j[n - 1, far]
     return j.reshape(4, *shape)
 
 

@@ -12,6 +12,7 @@ Notation:
 
 from cmath import rect
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,7 +57,7 @@ class Unicycle(NonlinearModel):
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
     ) -> FloatArray:
         """Return the states (..., 4) after a share of an interval with the input held."""
-        return _Arc(states, inputs, self.dt * np.asarray(fraction)).after()
+        return _Arc(states, inputs, self._time(fraction)).after()
 
     def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state (4,)."""
@@ -72,7 +73,7 @@ class Unicycle(NonlinearModel):
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
     ) -> Linearisation:
         """Return `advance` with its exact derivatives; arguments as there."""
-        arc = _Arc(states, inputs, self.dt * np.asarray(fraction))
+        arc = _Arc(states, inputs, self._time(fraction))
         after = arc.after()
         both = np.zeros((*after.shape, 6))
         both[...] = _IDENTITY
@@ -83,7 +84,7 @@ class Unicycle(NonlinearModel):
 
     def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
         """Return sum_k y_k (Hessian of f_k in (x, u)), (..., 6, 6), over one interval."""
-        arc = _Arc(states, inputs, np.asarray(self.dt))
+        arc = _Arc(states, inputs, self.dt)
         dual = costates[..., 0] - 1j * costates[..., 1]
         bent = np.zeros((*np.broadcast_shapes(arc.way.shape, dual.shape), 6, 6))
         for (row, column), entry in arc.bends().items():
@@ -100,11 +101,14 @@ class Unicycle(NonlinearModel):
         moving = np.stack([courses(velocity), speed], axis=-1)
         return np.concatenate([position, moving], axis=-1)
 
+    def _time(self, fraction: ArrayLike) -> float | FloatArray:
+        return self.dt * (fraction if isinstance(fraction, float) else np.asarray(fraction))
+
 
 class _Arc:
     """The way (...) as complex numbers, and its derivatives."""
 
-    def __init__(self, states: FloatArray, inputs: FloatArray, h: FloatArray) -> None:
+    def __init__(self, states: FloatArray, inputs: FloatArray, h: Any) -> None:
         """Evaluate from states (..., 4) with inputs (..., 2) held for times h (...)."""
         self.states, self.inputs, self.h, self.half = states, inputs, h, 0.5 * h
         mu = self.half * inputs[..., 1]
@@ -128,30 +132,27 @@ class _Arc:
         after[..., 3] = self.speed + self.alpha
         return after
 
-    def slopes(self) -> list[ComplexArray]:
+    def slopes(self) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
         """Derivatives of the way with respect to theta, v, a and omega."""
         j0, j1, j2, _ = self.j
-        self.slope = -j1, (j0 - 2.0 * j2) / 3.0
-        self.sum = j0 + 1j * j1
-        self.bend = self.mixed(*self.slope)
-        by_theta = 1j * self.way
         half = self.half * self.turned
-        by_omega = self.half * by_theta + half * self.bend
-        return [by_theta, self.turned * j0, half * self.sum, by_omega]
+        by_theta = 1j * self.way
+        by_omega = self.half * by_theta + half * self.mixed(-j1, (j0 - 2.0 * j2) / 3.0)
+        return by_theta, self.turned * j0, half * (j0 + 1j * j1), by_omega
 
     def bends(self) -> dict[tuple[int, int], ComplexArray]:
         """Second derivatives that are not zero, by pairs of indices within (x, u)."""
         _, by_v, by_a, by_omega = self.slopes()
-        j0, j1, _, j3 = self.j
-        d0, d1 = self.slope
-        second = self.mixed(-d1, -(j1 + (4.0 * j1 - 6.0 * j3) / 5.0) / 3.0)
+        j0, j1, j2, j3 = self.j
         half = self.half * self.turned
+        bend = self.mixed((2.0 * j2 - j0) / 3.0, (2.0 * j3 - 3.0 * j1) / 5.0)
+        turning = 1j * by_a
         return {
             (2, 2): -self.way,
             (2, 3): 1j * by_v,
-            (2, 4): 1j * by_a,
+            (2, 4): turning,
             (2, 5): 1j * by_omega,
-            (3, 5): half * (1j * j0 + d0),
-            (4, 5): self.half * half * (1j * self.sum + d0 + 1j * d1),
-            (5, 5): self.half * (2j * by_omega + self.half * self.way + half * second),
+            (3, 5): turning,
+            (4, 5): self.half * half * (1j / 3.0 * (4.0 * j0 - 2.0 * j2) - 2.0 * j1),
+            (5, 5): self.half * (2j * by_omega + self.half * self.way + half * bend),
         }
