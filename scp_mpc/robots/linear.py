@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import fractional_matrix_power
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
-from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.robots.model import Linearisation, Model, as_period
+from scp_mpc.errors import ShapeError
+from scp_mpc.robots.model import Linearisation, Model, as_period, as_places
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,7 @@ class LinearModel(Model):
         if B.shape[1] == 0:
             raise ShapeError("B", f"shape {B.shape} has no input")
         dt = as_period(self.dt)
-        position = np.array(self.position)
-        whole = position.dtype.kind in "iu" and position.shape in ((2,), (3,))
-        if not whole or len(set(position.tolist()) & set(range(len(A)))) < len(position):
-            raise InvalidArgumentError(
-                "position", f"{self.position!r} is not 2 or 3 distinct indices below {len(A)}"
-            )
-        position = position.astype(np.intp)
-        position.setflags(write=False)
+        position = as_places(self.position, len(A))
         object.__setattr__(self, "A", frozen(A))
         object.__setattr__(self, "B", frozen(B))
         object.__setattr__(self, "dt", dt)

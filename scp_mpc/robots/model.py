@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_number, frozen
-from scp_mpc.errors import BoundsError, JacobianError
+from scp_mpc.errors import BoundsError, InvalidArgumentError, JacobianError
 
 _STEP = float(np.finfo(np.float64).eps ** (1 / 3))
 
@@ -111,7 +111,7 @@ class Model(ABC):
             both = np.concatenate([there.A, there.B], axis=-1)
             return (costates[..., None, :] @ both)[..., 0, :]
 
-        bent = np.moveaxis(_differences(gradients, _joined(states, inputs)), 0, -1)
+        bent = np.moveaxis(differences(gradients, joined(states, inputs)), 0, -1)
         return 0.5 * (bent + np.swapaxes(bent, -2, -1))
 
     @abstractmethod
@@ -143,9 +143,9 @@ class Model(ABC):
         """
         states = as_array("x", x)
         inputs = as_array("u", u)
-        z = _joined(states, inputs)
+        z = joined(states, inputs)
         given = self.linearise(states, inputs)
-        found = _differences(lambda z: self.advance(z[..., : self.nx], z[..., self.nx :]), z)
+        found = differences(lambda z: self.advance(z[..., : self.nx], z[..., self.nx :]), z)
         both = as_array("linearise", np.concatenate([given.A, given.B], axis=-1))
         slopes = as_array("advance", np.moveaxis(found, 0, -1))
         scale = np.maximum(1.0, np.abs(slopes).max(axis=-1, keepdims=True))
@@ -176,6 +176,21 @@ def as_period(dt: object) -> float:
     return period
 
 
+def as_places(position: object, nx: int) -> IntArray:
+    """Return the indices of the position within the state.
+
+    Raises:
+        InvalidArgumentError: They are not 2 or 3 distinct indices below nx.
+    """
+    array = np.array(position)
+    whole = array.dtype.kind in "iu" and array.shape in ((2,), (3,))
+    if not whole or len(set(array.tolist()) & set(range(nx))) < len(array):
+        raise InvalidArgumentError(
+            "position", f"{position!r} is not 2 or 3 distinct indices below {nx}"
+        )
+    return indices(*array.tolist())
+
+
 def indices(*places: int) -> IntArray:
     """Return places within the state, read-only."""
     array = np.array(places, dtype=np.intp)
@@ -200,13 +215,14 @@ def courses(velocity: FloatArray) -> FloatArray:
     return unwrapped
 
 
-def _joined(states: FloatArray, inputs: FloatArray) -> FloatArray:
+def joined(states: FloatArray, inputs: FloatArray) -> FloatArray:
+    """Return z (..., nx+nu) of states (..., nx) and inputs (..., nu)."""
     shape = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1])
     parts = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in (states, inputs)]
     return np.concatenate(parts, axis=-1)
 
 
-def _differences(function: Any, z: FloatArray) -> FloatArray:
+def differences(function: Any, z: FloatArray) -> FloatArray:
     """Central differences (n, ..., m) of a batched function of z (..., n)."""
     n = z.shape[-1]
     h = _STEP * np.maximum(1.0, np.abs(z))
