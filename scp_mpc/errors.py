@@ -47,6 +47,10 @@ class JacobianError(InvalidArgumentError):
     """A model's derivatives are not those of the model."""
 
 
+class GeometryError(InvalidArgumentError):
+    """Points or half-spaces do not make a convex body with an inside."""
+
+
 class ConcurrentUseError(ScpMpcError):
     """One solver was called from two threads at once; each needs its own."""
 
