@@ -1,14 +1,16 @@
-"""Obstacles: their predicted Gaussians, the predictors, and the report's obstacle."""
+"""Obstacles: their predicted Gaussians and shapes, the predictors, and the report's obstacle."""
 
 from scp_mpc.obstacles.ageing import aged
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor, Predictor, ReportPredictor
+from scp_mpc.obstacles.shape import Polytope
 
 __all__ = [
     "CircularObstacle",
     "ConstantVelocityPredictor",
     "ObstaclePrediction",
+    "Polytope",
     "Predictor",
     "ReportPredictor",
     "aged",

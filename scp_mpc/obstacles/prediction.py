@@ -9,16 +9,20 @@ from numpy.typing import ArrayLike, NDArray
 from scp_mpc.arrays import (
     FloatArray,
     as_array,
+    as_count,
     as_number,
     frozen,
     require_positive_semidefinite,
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
+from scp_mpc.obstacles.solid import Solid
 
 
 @dataclass(frozen=True, eq=False)
 class ObstaclePrediction:
-    """Gaussian positions N(mean_i, covariance_i) of a round obstacle at i = 0 .. N.
+    """Gaussian positions N(mean_i, covariance_i) of an obstacle at i = 0 .. N.
+
+    It is a ball, or a polytope that does not turn, with the origin of its frame at the position.
 
     Row 0 is now, or at `stamp` where that is given; the controller constrains rows 1 .. N.
     `dataclasses.replace(prediction, stamp=..., name=...)` adds what a predictor does not know.
@@ -26,9 +30,11 @@ class ObstaclePrediction:
     Args:
         means: (N+1, d) expected positions [m].
         covariances: (N+1, d, d) position covariances [m^2], or one (d, d) for all rows.
-        radius: Radius of the obstacle [m].
+        radius: Radius of the obstacle, or by which its shape is rounded [m].
         stamp: Time of row 0 [s], on the clock of `MPC.step`; None for now.
         name: Who it is, the same at every step, for example a tracker's number; None for nobody.
+        shape: A `Polytope`; None for a ball. Of a polytope's covariances the largest standard
+            deviation counts, in all directions; zero covariances make it a wall.
 
     Attributes:
         spread: (N+1,) largest standard deviation in any direction [m].
@@ -46,6 +52,7 @@ class ObstaclePrediction:
     radius: float
     stamp: float | None
     name: Hashable
+    shape: Solid | None
     spread: FloatArray = field(init=False)
 
     def __init__(
@@ -55,6 +62,7 @@ class ObstaclePrediction:
         radius: float,
         stamp: float | None = None,
         name: Hashable = None,
+        shape: Solid | None = None,
     ) -> None:
         """Copy, check and freeze."""
         mu = as_array("means", means, (-1, 2), (-1, 3))
@@ -72,7 +80,34 @@ class ObstaclePrediction:
             stamp = as_number("stamp", stamp)
         if name is not None:
             _require_hashable(name)
-        self._set(mu, Sigma, radius, stamp, name, variances)
+        if shape is not None:
+            _require_solid(shape, dim)
+        self._set(mu, Sigma, radius, stamp, name, shape, variances)
+
+    @classmethod
+    def still(
+        cls,
+        horizon: int,
+        at: ArrayLike,
+        radius: float,
+        name: Hashable = None,
+        shape: Solid | None = None,
+    ) -> "ObstaclePrediction":
+        """Return the prediction of what stays where it is, for certain: a pillar, a wall.
+
+        Args:
+            horizon: N, as in the problem.
+            at: (d,) position [m].
+            radius: Radius of a disc or ball, or by which the shape is rounded [m].
+            name: Who it is.
+            shape: A `Polytope`; None for a ball.
+        """
+        rows = as_count("horizon", horizon) + 1
+        position = as_array("at", at, (2,), (3,))
+        dim = len(position)
+        return cls(
+            np.tile(position, (rows, 1)), np.zeros((dim, dim)), radius, name=name, shape=shape
+        )
 
     def moved(
         self, means: FloatArray, covariances: FloatArray, stamp: float | None
@@ -80,7 +115,7 @@ class ObstaclePrediction:
         """Return the same obstacle elsewhere, unchecked: for what follows from checked arrays."""
         moved = object.__new__(ObstaclePrediction)
         variances = np.linalg.eigvalsh(covariances)
-        moved._set(means, covariances, self.radius, stamp, self.name, variances)
+        moved._set(means, covariances, self.radius, stamp, self.name, self.shape, variances)
         return moved
 
     def _set(
@@ -90,6 +125,7 @@ class ObstaclePrediction:
         radius: float,
         stamp: float | None,
         name: Hashable,
+        shape: Solid | None,
         variances: NDArray[np.floating],
     ) -> None:
         spread = np.sqrt(np.maximum(variances[:, -1], 0.0))
@@ -98,6 +134,7 @@ class ObstaclePrediction:
         object.__setattr__(self, "radius", radius)
         object.__setattr__(self, "stamp", stamp)
         object.__setattr__(self, "name", name)
+        object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spread", frozen(spread))
 
     @property
@@ -116,6 +153,13 @@ def _require_hashable(name: object) -> None:
         hash(name)
     except TypeError:
         raise InvalidArgumentError("name", f"{name!r} is not hashable") from None
+
+
+def _require_solid(shape: object, dim: int) -> None:
+    if not isinstance(shape, Solid):
+        raise InvalidArgumentError("shape", f"{shape!r} is not a Polytope")
+    if shape.dim != dim:
+        raise ShapeError("shape", f"{shape.dim}-dimensional, but the means are {dim}-dimensional")
 
 
 def as_predictions(obstacles: object) -> tuple[ObstaclePrediction, ...]:
