@@ -6,18 +6,23 @@ Notation:
     y       (M, N, d)   R'(p - mu), position in the ellipsoid's axes [m]
     g       (M, N)      constraint function: outside the no-go set means g(p, s) >= 0 [m]
 
-Other symbols as in `no_go.py`. Both inflations return g together with its linearisation.
+Other symbols as in `no_go.py`. Both inflations return g together with its linearisation. For
+obstacles that are polytopes there is only one, that of `walls.py`.
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.safety.tangents import inverse_root, tangents
+from scp_mpc.safety.walls import clearance as wall_clearance
+from scp_mpc.safety.walls import linearise as linearise_walls
 
 _POINT = 1e-9  # [m] a semi-axis below this is that of a point
 
@@ -33,7 +38,6 @@ class Inflation(ABC):
         """Remember the reference size."""
         self._reference = reference
 
-    @abstractmethod
     def linearise(
         self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
     ) -> HalfSpaces:
@@ -43,8 +47,21 @@ class Inflation(ABC):
         set is not unique, the offset one stage earlier decides; at p = mu that is the direction
         opposite to the relative velocity: the side from which the robot comes.
         """
+        if sets.shapes is None:
+            return self._linearise(sets, positions, s, start)
+        positions = np.broadcast_to(positions, sets.means.shape)
+        M, N, d = sets.means.shape
+        whole = replace(HalfSpaces.none(M, N, d), bend=np.zeros((M, N, d, d - 1)))
+        j = sets.shapes.others
+        if len(j):
+            _put(self._linearise(sets.taken(j), positions[j], s[j], start[j]), whole, j)
+        j = sets.shapes.slots
+        if len(j):
+            offsets = positions[j] - sets.means[j]
+            side = partial(_one_stage_earlier, offsets, start[j])
+            _put(linearise_walls(sets.taken(j), positions[j], s[j], side), whole, j)
+        return whole
 
-    @abstractmethod
     def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """Factor L (M, N, d+1, d-1) of g's second derivative in (p, s): Hessian = L L'.
 
@@ -53,10 +70,45 @@ class Inflation(ABC):
             s: (M,) sizes where g was linearised.
             spaces: What `linearise` made of it there.
         """
+        if sets.shapes is None:
+            return self._bend(sets, s, spaces)
+        assert spaces.bend is not None
+        M, N, d = sets.means.shape
+        whole = np.zeros((M, N, d + 1, d - 1))  # s moves a wall's faces without turning them
+        whole[:, :, :d] = spaces.bend
+        j = sets.shapes.others
+        if len(j):
+            part = HalfSpaces(spaces.normal[j], spaces.slope[j], spaces.offset[j], spaces.value[j])
+            whole[j] = self._bend(sets.taken(j), s[j], part)
+        return whole
 
-    @abstractmethod
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """Signed distance (M, N) [m] to the no-go set at s = s_ref; plus infinity if inactive."""
+        if sets.shapes is None:
+            return self._clearance(sets, positions)
+        positions = np.broadcast_to(positions, sets.means.shape)
+        whole = np.empty(sets.means.shape[:2])
+        j = sets.shapes.others
+        if len(j):
+            whole[j] = self._clearance(sets.taken(j), positions[j])
+        j = sets.shapes.slots
+        if len(j):
+            whole[j] = wall_clearance(sets.taken(j), positions[j], self._reference)
+        return whole
+
+    @abstractmethod
+    def _linearise(
+        self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
+    ) -> HalfSpaces:
+        """`linearise` for ellipsoids."""
+
+    @abstractmethod
+    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+        """`bend` for ellipsoids."""
+
+    @abstractmethod
+    def _clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+        """`clearance` for ellipsoids."""
 
 
 class ExactInflation(Inflation):
@@ -71,7 +123,7 @@ class ExactInflation(Inflation):
     delta (Blackmore, Ono and Williams, 2011).
     """
 
-    def linearise(
+    def _linearise(
         self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
     ) -> HalfSpaces:
         """See the base class; normals are unit vectors."""
@@ -88,7 +140,7 @@ class ExactInflation(Inflation):
         offset = np.add.reduce(normal * sets.means, axis=-1) + sets.radii
         return _masked(sets, normal, slope, offset, sd - sets.radii)
 
-    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class.
 
         From y = grad h(n) + sd n with the support function h(n) = s |diag(sigma) n|: on the tangent
@@ -107,7 +159,7 @@ class ExactInflation(Inflation):
         L = T @ inverse_root(stiffness, _POINT)
         return np.concatenate([sets.rotations @ L, -pull[..., None, :] @ L], axis=-2)
 
-    def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+    def _clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """See the base class."""
         y = sets.to_eigenframe(positions - sets.means)
         sd, _ = signed_distance(y, self._reference * sets.deviations)
@@ -125,7 +177,7 @@ class AxesInflation(Inflation):
     al., 2019). Kept to reproduce the report. g is convex in p but not jointly in (p, s).
     """
 
-    def linearise(
+    def _linearise(
         self, sets: NoGoSets, positions: FloatArray, s: FloatArray, start: FloatArray
     ) -> HalfSpaces:
         """See the base class."""
@@ -146,7 +198,7 @@ class AxesInflation(Inflation):
         offset = np.add.reduce(normal * positions, axis=-1) + slope * s[:, None] - value
         return _masked(sets, normal, slope, offset, value)
 
-    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class; the change of w with s alone is left out: g is not convex in it."""
         e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[..., None], _POINT)
         scale = self._scale(sets)[..., None]
@@ -158,7 +210,7 @@ class AxesInflation(Inflation):
         across = -(norm * direction * sets.deviations)[..., None, :] @ L
         return np.concatenate([sets.rotations @ L, across], axis=-2)
 
-    def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
+    def _clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
         """See the base class."""
         y = sets.to_eigenframe(positions - sets.means)
         e = self._reference * sets.deviations + sets.radii[..., None]
@@ -179,6 +231,14 @@ def _nudged(direction: FloatArray) -> FloatArray:
     length = np.linalg.norm(direction, axis=-1, keepdims=True)
     first = np.eye(direction.shape[-1])[0]
     return 1e-12 * np.where(length > 0, direction / np.where(length > 0, length, 1.0), first)
+
+
+def _put(part: HalfSpaces, whole: HalfSpaces, slots: IntArray) -> None:
+    """Write the half-spaces of some slots into those of all."""
+    for name in ("normal", "slope", "offset", "value"):
+        getattr(whole, name)[slots] = getattr(part, name)
+    if part.bend is not None and whole.bend is not None:
+        whole.bend[slots] = part.bend
 
 
 def _masked(

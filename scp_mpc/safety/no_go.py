@@ -1,4 +1,4 @@
-"""The s-sigma ellipsoids of all obstacles along the horizon, stacked.
+"""The s-sigma ellipsoids of all obstacles along the horizon, stacked; and their shapes.
 
 Notation:
     M, N, d     obstacle slots, horizon, dimension of the workspace
@@ -15,6 +15,7 @@ import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.safety.polytopes import Polytopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,7 @@ class NoGoSets:
     """Eigen-decomposed predictions of M obstacle slots at N stages.
 
     Slots without an obstacle are inactive: they hold unit values, and what is computed from them
-    is discarded through `active`.
+    is discarded through `active`. `shapes` says which slots are polytopes; None if there are none.
     """
 
     means: FloatArray
@@ -30,6 +31,7 @@ class NoGoSets:
     deviations: FloatArray
     radii: FloatArray
     active: BoolArray
+    shapes: Polytopes | None = None
 
     @classmethod
     def from_predictions(
@@ -50,22 +52,36 @@ class NoGoSets:
         return cls._stacked(predictions, slice(0, 1), robot_radius, len(predictions), 1, dim)
 
     @classmethod
-    def pairs(cls, means: FloatArray, covariances: FloatArray, radii: FloatArray) -> "NoGoSets":
+    def pairs(
+        cls,
+        means: FloatArray,
+        covariances: FloatArray,
+        radii: FloatArray,
+        shapes: Polytopes | None = None,
+    ) -> "NoGoSets":
         """Single stages, each in a slot of its own: means (K, d), covariances (K, d, d).
 
         Args:
             means: Expected positions [m].
             covariances: Position covariances [m^2].
             radii: (K,) robot radius + obstacle radius [m].
+            shapes: Of the K slots; None if all are round.
         """
         variances, rotations = np.linalg.eigh(covariances)
         deviations = np.sqrt(np.maximum(variances, 0.0))
         on = np.ones(len(means), dtype=np.bool_)
-        return cls(means[:, None], rotations[:, None], deviations[:, None], radii[:, None], on)
+        return cls(
+            means[:, None], rotations[:, None], deviations[:, None], radii[:, None], on, shapes
+        )
 
     @classmethod
     def stacked(
-        cls, means: FloatArray, covariances: FloatArray, radii: FloatArray, slots: int
+        cls,
+        means: FloatArray,
+        covariances: FloatArray,
+        radii: FloatArray,
+        slots: int,
+        shapes: Polytopes | None = None,
     ) -> "NoGoSets":
         """Fill the first J slots with means (J, N, d), covariances (J, N, d, d), radii (J, N)."""
         count, stages, dim = means.shape
@@ -78,7 +94,8 @@ class NoGoSets:
             variances, rotations[:count] = np.linalg.eigh(covariances)
             deviations[:count] = np.sqrt(np.maximum(variances, 0.0))
             mu[:count], reach[:count] = means, radii
-        return cls(mu, rotations, deviations, reach, np.arange(slots) < count)
+        shapes = None if shapes is None else shapes.padded(slots)
+        return cls(mu, rotations, deviations, reach, np.arange(slots) < count, shapes)
 
     @classmethod
     def _stacked(
@@ -94,7 +111,8 @@ class NoGoSets:
         means = np.array([o.means[rows] for o in predictions]).reshape(count, horizon, dim)
         covariances = np.array([o.covariances[rows] for o in predictions])
         radii = robot_radius + np.array([o.radius for o in predictions])
-        return cls.stacked(means, covariances, np.tile(radii[:, None], horizon), slots)
+        radii, shapes = np.tile(radii[:, None], horizon), Polytopes.of(predictions)
+        return cls.stacked(means, covariances, radii, slots, shapes)
 
     def taken(self, slots: IntArray) -> "NoGoSets":
         """The given slots, in that order."""
@@ -104,6 +122,7 @@ class NoGoSets:
             self.deviations[slots],
             self.radii[slots],
             self.active[slots],
+            None if self.shapes is None else self.shapes.taken(slots),
         )
 
     def to_eigenframe(self, offsets: FloatArray) -> FloatArray:

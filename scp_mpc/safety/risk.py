@@ -19,6 +19,7 @@ from scipy.special import gammaincinv, ndtr, ndtri
 from scp_mpc.arrays import FloatArray
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.walls import clearance, largest
 
 LEAST_RISK = 1e-12  # smaller risks are not told apart: s stays below 7.04
 _NEWTON = 20  # steps at most; each is a sound bound
@@ -46,8 +47,32 @@ def risk_bound(sets: NoGoSets, positions: FloatArray) -> FloatArray:
 
     The best half-space is tangent to the largest ellipsoid (+) ball that leaves p outside: its
     size solves sd(p, s) = r, by Newton's method from s = 0. sd is convex and falls with s, so
-    that each step ends short of the root, and its half-space is a bound by itself.
+    that each step ends short of the root, and its half-space is a bound by itself. Of a polytope it
+    is the half-space at its nearest point, Phi(-(sd - r) / sigma) with the largest sigma, as the
+    plan was promised.
     """
+    if sets.shapes is None:
+        return _ellipsoids_risk(sets, positions)
+    positions = np.broadcast_to(positions, sets.means.shape)
+    risk = np.zeros(sets.means.shape[:2])
+    j = sets.shapes.others
+    if len(j):
+        risk[j] = _ellipsoids_risk(sets.taken(j), positions[j])
+    j = sets.shapes.slots
+    if len(j):
+        walls = sets.taken(j)
+        room, sigma = clearance(walls, positions[j], 0.0), largest(walls)
+        risk[j] = ndtr(-_over(room, sigma))
+    return risk
+
+
+def _over(room: FloatArray, width: FloatArray) -> FloatArray:
+    """Standard deviations that fit into the room: all or none where there is no deviation."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.where(width > 0, room / width, np.where(room >= 0, np.inf, -np.inf))
+
+
+def _ellipsoids_risk(sets: NoGoSets, positions: FloatArray) -> FloatArray:
     y = sets.to_eigenframe(positions - sets.means)
     s = np.zeros(y.shape[:-1])
     bound = np.full(s.shape, -np.inf)
@@ -56,8 +81,7 @@ def risk_bound(sets: NoGoSets, positions: FloatArray) -> FloatArray:
         room = np.add.reduce(n * y, axis=-1) - sets.radii
         across = sets.deviations * n
         width = np.sqrt(np.add.reduce(across * across, axis=-1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reached = np.where(width > 0, room / width, np.where(room >= 0, np.inf, -np.inf))
+        reached = _over(room, width)
         better = reached > bound + _CLOSE
         bound = np.maximum(bound, reached)
         if not better.any():

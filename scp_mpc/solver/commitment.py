@@ -40,7 +40,9 @@ def point_risks(step: StepData, path: FloatArray) -> FloatArray:
     if not step.count:
         return np.zeros((0, step.sampling.points))
     plain = step.unscaled()
-    sets = NoGoSets.stacked(plain.means[:, 1:], plain.covariances[:, 1:], plain.radii, plain.count)
+    sets = NoGoSets.stacked(
+        plain.means[:, 1:], plain.covariances[:, 1:], plain.radii, plain.count, plain.shapes
+    )
     return risk_bound(sets, path)
 
 

@@ -60,7 +60,8 @@ class Conflicts:
         self._step, self._p = step, layout.p
         self._chart: Chart | None = None
         covariances = step.covariances[j, i + 1]
-        self._sets = NoGoSets.pairs(step.means[j, i + 1], covariances, step.radii[j, i])
+        shapes = None if step.shapes is None else step.shapes.taken(j)
+        self._sets = NoGoSets.pairs(step.means[j, i + 1], covariances, step.radii[j, i], shapes)
         self._means_before = step.means[j, i]
 
     def response(self, chart: Chart) -> FloatArray:

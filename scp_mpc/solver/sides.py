@@ -14,7 +14,6 @@ Notation:
     v       (d,)        motion relative to the obstacle in one stage, over the conflict [m]
     n       (d,)        side: a unit vector square to v
     tau                 stages by which the candidate passes later (negative) or earlier
-    e       (C, d)      semi-axes s sigma + r; w and m are offset and n in units of them
 """
 
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from itertools import islice
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.solver.detours import WAYS, Ellipsoids, Walls
 from scp_mpc.solver.step_data import StepData
 
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
@@ -114,9 +114,19 @@ def same_way(step: StepData, first: Passing, second: Passing) -> bool:
         return False
     j, i = np.nonzero(mine)
     i = K * (i + 1) - 1  # the samples of those stages
-    a, b = (passing.path[i] - step.means[j, i + 1] for passing in (first, second))
+    a, b = (_outward(step, passing.path, j, i) for passing in (first, second))
     apart = (a * b).sum(axis=1) < _COSINE * np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     return not apart.any()
+
+
+def _outward(step: StepData, path: FloatArray, j: IntArray, i: IntArray) -> FloatArray:
+    """Directions (K, d) in which points lie from their obstacles: of polytopes, the normals."""
+    y = path[i] - step.means[j, i + 1]
+    if step.shapes is not None:
+        shapes = step.shapes.taken(j)
+        k = shapes.slots
+        y[k] = shapes.taken(k).nearest(y[k, None]).normal[:, 0]
+    return y
 
 
 def _ways(
@@ -131,11 +141,17 @@ def _ways(
     points = _first_run(conflict, around)
     v, normals = _directions(free - step.means[j, 1:], points, K)
     reach = slice(max(points[0] - around, 0), points[-1] + around + 1)
-    ellipsoids = _Ellipsoids.of(step, s, j, reach)
-    for time, push in _WAYS:
+    body: Ellipsoids | Walls = Ellipsoids.of(step, s, j, reach)
+    if step.shapes is not None and step.shapes.kind[j] >= 0:
+        body = Walls.of(step, s, j, reach)
+        for n in body.faces(normals):
+            path = elsewhere.copy()
+            path[reach] = body.aside(free[reach], n)
+            yield Side(j, n, 0.0, path)
+    for time, push in WAYS:
         for n in normals:
             path = elsewhere.copy()
-            path[reach] = push(ellipsoids, free[reach] + time * v, n)
+            path[reach] = push(body, free[reach] + time * v, n)
             yield Side(j, n, time, path)
 
 
@@ -156,46 +172,3 @@ def _directions(
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
     square = np.linalg.svd(v[None])[2][1:]
     return v, [sign * n for n in square for sign in (1.0, -1.0)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Ellipsoids:
-    """One obstacle's ellipsoids at some stages, their axes lengthened by the radii."""
-
-    means: FloatArray
-    scaling: FloatArray  # (N, d, d) takes offsets to units of the semi-axes
-
-    @classmethod
-    def of(cls, step: StepData, s: float, j: int, reach: slice) -> "_Ellipsoids":
-        variances, rotations = np.linalg.eigh(step.covariances[j, 1:][reach])
-        radii = step.radii[j, reach, None]
-        e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + radii, 1e-9)
-        return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
-
-    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move the points of a path (k, d) that lie within along n to the boundary."""
-        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
-        m = self.scaling @ n
-        mm, wm = (m * m).sum(axis=1), (w * m).sum(axis=1)
-        room = 1 - (w * w).sum(axis=1)  # positive inside
-        shift = np.where(room > 0, (np.sqrt(wm**2 + mm * np.maximum(room, 0.0)) - wm) / mm, 0.0)
-        return path + shift[:, None] * n
-
-    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move them away from the centre, and half as much towards n, to the boundary."""
-        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
-        m = self.scaling @ n
-        within = (w * w).sum(axis=1) < 1
-        w[within] += 0.5 * m[within] / np.linalg.norm(m[within], axis=1, keepdims=True)
-        w[within] /= np.maximum(np.linalg.norm(w[within], axis=1, keepdims=True), 1e-12)
-        boundary: FloatArray = self.means + np.linalg.solve(self.scaling, w[..., None])[..., 0]
-        return boundary
-
-
-# tau, and how to leave the no-go set: as the free plan would, one stage later or earlier, two later
-_WAYS = (
-    (0.0, _Ellipsoids.aside),
-    (-1.0, _Ellipsoids.aside),
-    (1.0, _Ellipsoids.aside),
-    (-2.0, _Ellipsoids.outward),
-)

@@ -20,6 +20,7 @@ from scp_mpc.problem import Problem
 from scp_mpc.safety.halfspaces import HalfSpaces
 from scp_mpc.safety.margin import Margin
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.polytopes import Polytopes
 from scp_mpc.solver.sampling import Sampling
 
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
@@ -40,6 +41,7 @@ class StepData:
         robot_covariance: (N+1, d, d) of the robot's own position [m^2], or None.
         scale: (J, C) what multiplies the standard deviations: sizes over s_ref; or None for one.
         u_last: (nu,) input last applied, from which the first rate counts; None for unknown.
+        shapes: Which obstacles are polytopes; None if all are round.
     """
 
     problem: Problem
@@ -52,6 +54,7 @@ class StepData:
     robot_covariance: FloatArray | None = None
     scale: FloatArray | None = None
     u_last: FloatArray | None = None
+    shapes: Polytopes | None = None
 
     @classmethod
     def read(
@@ -96,7 +99,7 @@ class StepData:
         radii = np.repeat(radii[:, None], sampling.points, axis=1)
         means = sampling.interpolated(means)
         given = problem, state, reference, obstacles, sampling, means, radii, uncertain
-        step = cls(*given, u_last=last)
+        step = cls(*given, u_last=last, shapes=Polytopes.of(obstacles))
         return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
 
     @property
@@ -147,7 +150,7 @@ class StepData:
         means, M = self.means[:, 1:], self.problem.max_obstacles
         if not self.count:
             return NoGoSets.stacked(means, np.zeros((*means.shape, means.shape[-1])), self.radii, M)
-        return NoGoSets.stacked(means, self.covariances[:, 1:], self.radii, M)
+        return NoGoSets.stacked(means, self.covariances[:, 1:], self.radii, M, self.shapes)
 
     @cached_property
     def start(self) -> FloatArray:
@@ -224,7 +227,8 @@ class StepData:
 
         The direction n from the mean to p gives a lower bound of the signed distance to the
         s-sigma ellipsoid, n'(p - mu) - s sqrt(n' Sigma n), and n' Sigma n is at most the largest
-        variance. Who is clear by these bounds is clear of either inflation's no-go set.
+        variance. Who is clear by these bounds is clear of either inflation's no-go set. Polytopes
+        are measured with the distance itself.
 
         Args:
             positions: (C+1, d) of the robot [m].
@@ -234,6 +238,26 @@ class StepData:
         """
         if not self.obstacles:
             return None
+        near = self._within_ellipsoids(positions, s, distance, known)
+        if self.shapes is None:
+            return near
+        j = self.shapes.slots
+        room = self.shapes.taken(j).distance(positions[1:] - self.means[j, 1:]) - self.radii[j]
+        close = room <= s[j, None] * self.spreads[j, 1:] + distance
+        if known is not None:
+            close &= ~known[j]
+        near = np.zeros(self.radii.shape, dtype=np.bool_) if near is None else near
+        near[j] = close
+        return near if near.any() else None
+
+    def _within_ellipsoids(
+        self,
+        positions: FloatArray,
+        s: FloatArray,
+        distance: float,
+        known: BoolArray | None,
+    ) -> BoolArray | None:
+        """`within` for obstacles that are round."""
         y = positions[1:] - self.means[:, 1:]
         length2 = _squared(y)
         reach = self.radii + distance
@@ -264,7 +288,8 @@ class StepData:
         if near is not None:
             j, i = np.nonzero(near)
             covariances = self.covariances[j, i + 1]
-            sets = NoGoSets.pairs(self.means[j, i + 1], covariances, self.radii[j, i])
+            shapes = None if self.shapes is None else self.shapes.taken(j)
+            sets = NoGoSets.pairs(self.means[j, i + 1], covariances, self.radii[j, i], shapes)
             before = path[i - 1] - self.means[j, i]
             g = self.problem.no_go.linearise(sets, path[i][:, None], s[j], before).value
             depths[j, i] = np.maximum(0.0, -g[:, 0])
