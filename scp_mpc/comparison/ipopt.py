@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model
+from scp_mpc.comparison.nlp import Unknowns, linear_model, require_round
 from scp_mpc.comparison.peer_plan import PeerMissingError, PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -85,6 +85,7 @@ class Ipopt:
         began = perf_counter()
         problem, unknowns = self.problem, self._unknowns
         step = StepData.read(problem, x0, x_ref, obstacles)
+        require_round(step.obstacles)
         nominal = as_iterate(guess, problem)
         z, lower, upper = unknowns.pack(nominal), unknowns.lower, unknowns.upper
         if self._lifted:

@@ -11,10 +11,13 @@ For the report's "axes" g is the left side of (14) less 1, its square form as pr
 which each peer writes in the way that suits it.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.solver.iterate import Iterate
@@ -74,3 +77,16 @@ class Unknowns:
         later, inputs, s = np.split(z, self.ends)
         states = np.concatenate([x0[None], later.reshape(self._shapes[0])])
         return states, inputs.reshape(self._shapes[1]), s
+
+
+def require_round(obstacles: Sequence[ObstaclePrediction]) -> None:
+    """Refuse obstacles that are polytopes: the peers' programs know ellipsoids only.
+
+    Raises:
+        InvalidArgumentError: With the first one that has a shape.
+    """
+    for j, obstacle in enumerate(obstacles):
+        if obstacle.shape is not None:
+            raise InvalidArgumentError(
+                f"obstacles[{j}].shape", f"{obstacle.shape!r}, but peers know ellipsoids only"
+            )

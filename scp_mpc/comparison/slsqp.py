@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import Bounds, minimize
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model
+from scp_mpc.comparison.nlp import Unknowns, linear_model, require_round
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -54,6 +54,7 @@ class Slsqp:
         began = perf_counter()
         problem, unknowns = self.problem, self._unknowns
         step = StepData.read(problem, x0, x_ref, obstacles)
+        require_round(step.obstacles)
 
         def cost(z: FloatArray) -> float:
             return problem.cost(*unknowns.unpack(z, step.x0), step.x_ref)

@@ -95,6 +95,7 @@ class Staged:
         problem = self.problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
         step = StepData.read(problem, x0, x_ref, obstacles)
+        require_round(step.obstacles)
         nominal = as_iterate(guess, problem)
         sizes = np.broadcast_to(nominal.s, (N + 1, M))
         stages = np.concatenate([nominal.states, sizes], axis=1)
