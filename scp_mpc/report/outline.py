@@ -25,7 +25,8 @@ def no_go_outline(
 
         mu + s Sigma n / sqrt(n' Sigma n) + r n;
 
-    with the axes' inflation it is the ellipse with semi-axes s sigma_l + r.
+    with the axes' inflation it is the ellipse with semi-axes s sigma_l + r. Around a polygon it is
+    the corner that lies farthest along n, plus (s sigma_max + r) n.
 
     Raises:
         ValueError: The prediction is not planar.
@@ -43,6 +44,9 @@ def no_go_outline(
     r = sets.radii[0, at]
     angle = np.linspace(0.0, 2 * np.pi, _POINTS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if prediction.shape is not None:
+        corners = prediction.shape.vertices
+        return mean + corners[(n @ corners.T).argmax(axis=1)] + (s * sigma.max() + r) * n
     if problem.inflation == "axes":
         return mean + ((s * sigma + r) * n) @ rotation.T
     support = np.maximum(np.linalg.norm(sigma * n, axis=-1, keepdims=True), 1e-300)
