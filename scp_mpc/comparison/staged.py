@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.ipopt import import_casadi, parameters
-from scp_mpc.comparison.nlp import linear_model
+from scp_mpc.comparison.nlp import linear_model, require_round
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
