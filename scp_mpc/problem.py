@@ -10,7 +10,8 @@
                du_min <= u_i - u_{i-1} <= du_max  (u_{-1} the input last applied, if it is known)
                x_min - e_i <= x_i <= x_max + e_i,  e_i >= 0
 
-There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Bounds of states
+There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Inputs are weighed
+from the model's `idle`, which is zero but for robots that hover. Bounds of states
 and of rates are there where they are given. Those of states give way at an exact price: where they
 can be kept, they are, and the excess e is reported where they cannot, as after a start outside
 them. Those of inputs and rates never give way; for there always to be such inputs, holding an input
@@ -263,7 +264,8 @@ class Problem:
         """Return the cost of states (N+1, nx), inputs (N, nu) and sizes s (M,), without slack."""
         error = states[1:] - x_ref[1:]
         track = np.vdot(error[:-1] @ self.Q, error[:-1]) + error[-1] @ self.Qf @ error[-1]
-        effort = np.vdot(inputs @ self.R, inputs)
+        push = inputs - self.model.idle
+        effort = np.vdot(push @ self.R, push)
         deviation = s - self.size.reference
         return float(track + effort + self.size.weight * (deviation @ deviation))
 

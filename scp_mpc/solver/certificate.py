@@ -138,9 +138,10 @@ class Certificate:
         problem, c = self._problem, self._layout
         u, e, w = rolled.inputs, rolled.deviations, problem.size.weight
         away = y[c.s] - problem.size.reference
-        track, effort = e @ problem.Q, u @ problem.R
+        push = u - problem.model.idle
+        track, effort = e @ problem.Q, push @ problem.R
         track[-1] = e[-1] @ problem.Qf
-        cost = float(np.vdot(track, e) + np.vdot(effort, u) + w * (away @ away))
+        cost = float(np.vdot(track, e) + np.vdot(effort, push) + w * (away @ away))
         scale = max(1.0, 2 * float(np.abs(track).max()), 2 * float(np.abs(effort).max()))
         nu, on_u, on_s = self.costates(rolled, e, reaction, pushed)
         stationarity = float(np.abs(2 * effort - rolled.motion.thrust(nu) - on_u).max())

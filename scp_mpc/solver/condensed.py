@@ -109,4 +109,6 @@ class Condensed(Condensation):
         L: FloatArray = np.linalg.cholesky((moved + moved.T) / 2).astype(np.float64)
         along: FloatArray = solve_triangular(L, positions, lower=True).T
         deviations: FloatArray = solve_triangular(L, e.T, lower=True).T
-        return self.layout.response(along, L, deviations)
+        stages = deviations.reshape(self._problem.horizon, -1, pushes)
+        bounded = stages[:, self._problem.bounded_states].reshape(-1, pushes)
+        return self.layout.response(along, L, bounded)

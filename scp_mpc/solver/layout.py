@@ -83,13 +83,15 @@ class Layout:
             parts.append(e[:, self._states].ravel())
         return np.concatenate(parts)
 
-    def response(self, positions: FloatArray, inputs: FloatArray, e: FloatArray) -> FloatArray:
+    def response(
+        self, positions: FloatArray, inputs: FloatArray, bounded: FloatArray
+    ) -> FloatArray:
         """Stack the responses (ny, nv) of y.
 
         Args:
             positions: (C d, N nu) of p to the inputs' coordinates.
             inputs: (N nu, N nu) of u.
-            e: (N nx, N nu) of the deviations.
+            bounded: (N nb, N nu) of the bounded states.
         """
         N, nu = self.shape
         S = np.zeros((self.size, self.variables))
@@ -99,9 +101,7 @@ class Layout:
         if self._rates:
             S[self.du, : N * nu] = inputs
             S[self.du.start + nu : self.du.stop, : N * nu] -= inputs[:-nu]
-        if len(self._states):
-            rows = e.reshape(N, -1, N * nu)[:, self._states]
-            S[self.z, : N * nu] = rows.reshape(-1, N * nu)
+        S[self.z, : N * nu] = bounded
         return S
 
     @property

@@ -161,7 +161,7 @@ class TrustRegion(Search):
         states[0] = step.data.x0
         states[1:] += rolled.deviations
         hessians = step.problem.model.curvature(states[:-1], rolled.inputs, -nu)
-        W = chart.curvature(hessians, chart.response[step.layout.u]) - bends.T @ bends
+        W = chart.curvature(hessians) - bends.T @ bends
         return newton_step(held, held.v - chart.here, W)
 
     def _accepted(

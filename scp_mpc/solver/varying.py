@@ -35,29 +35,37 @@ class VaryingChart(Chart):
     Attributes:
         here: (nv,) where that plan is.
         deviations: (N, nx) its e.
-        along: (N nx, nv) responses of e.
+        G: (N, nx, N nu) responses of e to the inputs.
+        back: (N nu, N nu) L^-T, responses of the inputs to v.
     """
 
     here: FloatArray
     deviations: FloatArray
-    along: FloatArray
+    G: FloatArray
+    back: FloatArray
 
     def guess(self, v: FloatArray) -> FloatArray:
         """See the base class."""
-        moved = self.along @ (v - self.here)
-        return self.deviations + moved.reshape(self.deviations.shape)
+        moved = self.back @ (v - self.here)[: len(self.back)]
+        e: FloatArray = self.deviations + self.G @ moved
+        return e
 
-    def curvature(self, hessians: FloatArray, inputs: FloatArray) -> FloatArray:
+    def curvature(self, hessians: FloatArray) -> FloatArray:
         """Second derivatives (nv, nv) of what hessians (N, nx+nu, nx+nu) of all stages add up to.
 
-        `inputs` (N nu, nv) are the responses of the inputs.
+        State 0 is given; the others respond to the inputs by G.
         """
-        N, nx = self.deviations.shape
-        T = np.zeros((N, hessians.shape[1], self.along.shape[1]))
-        T[1:, :nx] = self.along.reshape(N, nx, -1)[:-1]
-        T[:, nx:] = inputs.reshape(N, -1, T.shape[2])
-        flat = T.reshape(-1, T.shape[2])
-        bent: FloatArray = flat.T @ (hessians @ T).reshape(flat.shape)
+        N, nx, n = self.G.shape
+        x, u, later, G = slice(nx), slice(nx, None), hessians[1:], self.G[:-1]
+        W = np.zeros((n, n))
+        W[n // N :] = (later[:, u, x] @ G).reshape(-1, n)
+        W += W.T
+        W += (later[:, x, x] @ G).reshape(-1, n).T @ G.reshape(-1, n)
+        stages = W.reshape(N, n // N, N, n // N)
+        i = np.arange(N)
+        stages[i, :, i] += hessians[:, u, u]
+        bent = np.zeros((len(self.here), len(self.here)))
+        bent[:n, :n] = self.back.T @ W @ self.back
         return bent
 
 
@@ -113,19 +121,18 @@ class Varying(Condensation):
         G = motion.respond(self._unit)
         QG = 2 * problem.Q @ G
         QG[-1] = 2 * problem.Qf @ G[-1]
-        flat = G.reshape(-1, inputs)
-        weighed = QG.reshape(-1, inputs)
+        flat, weighed = G.reshape(-1, inputs), QG.reshape(-1, inputs)
         L, info = dpotrf(flat.T @ weighed + self._effort, lower=1, clean=1)
         if info != 0:
             raise np.linalg.LinAlgError("the Hessian is not positive definite")
         inverse, _ = dtrtri(L, lower=1)
         back = np.ascontiguousarray(inverse.T)
-        along = flat @ back
-        S = layout.response(motion.positions(along.reshape(G.shape), back), back, along)
-        gradient = 2 * (u @ problem.R).ravel() + e.ravel() @ weighed
-        here = np.concatenate(
-            [inverse @ gradient, layout.stiffness * (s - problem.size.reference)[: layout.moving]]
-        )
+        bounded = G[:, problem.bounded_states].reshape(-1, inputs) @ back
+        S = layout.response(motion.positions(G, self._unit) @ back, back, bounded)
+        effort = (u - problem.model.idle) @ problem.R
+        gradient = 2 * effort.ravel() + e.ravel() @ weighed
+        away = (s - problem.size.reference)[: layout.moving]
+        here = np.concatenate([inverse @ gradient, layout.stiffness * away])
         y = layout.outputs(self._step, rolled.positions, s, u, e)
 
         def cost_free() -> float:
@@ -133,10 +140,7 @@ class Varying(Condensation):
             states[1:] += e
             return problem.cost(states, u, s, self._step.x_ref) - float(here @ here) / 2
 
-        full = np.zeros((len(along), layout.variables))
-        full[:, :inputs] = along
-        boxed = S[layout.boxed]
-        return VaryingChart(y - S @ here, S, boxed, cost_free, here, e, full)
+        return VaryingChart(y - S @ here, S, S[layout.boxed], cost_free, here, e, G, back)
 
     def _about(self, states: FloatArray, inputs: FloatArray) -> tuple[VaryingMotion, FloatArray]:
         """The motion along states (N+1, nx), without positions, and the states it leads to."""

@@ -1,0 +1,220 @@
+"""An independent formulation for every model in CasADi: the referee of nonlinear convergence tests.
+
+Nothing here comes from the package but the numbers of the problem. The dynamics are written anew;
+the unicycle's arc is a Gauss-Legendre quadrature. Outside an obstacle means that some n, |n| <= 1,
+has n'(p - mu) - s sqrt(n' Sigma n) >= r, so that n joins the variables: by its angle in the plane,
+by its three entries in space. The sizes s are fixed, and nothing is softened.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi
+import numpy as np
+
+_OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 3000}
+_NEAR = {
+    "mu_init": 1e-9,
+    "bound_push": 1e-10,
+    "bound_frac": 1e-10,
+    "slack_bound_push": 1e-10,
+    "slack_bound_frac": 1e-10,
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What IPOPT found."""
+
+    X: np.ndarray
+    U: np.ndarray
+    cost: float
+    ok: bool
+
+
+def symbolic(model) -> Callable:
+    """The next state in CasADi, of a state and an input in CasADi."""
+    kind = type(model).__name__
+    if hasattr(model, "A"):
+        return lambda x, u: (
+            casadi.mtimes(casadi.DM(model.A), x) + casadi.mtimes(casadi.DM(model.B), u)
+        )
+    if kind == "Unicycle":
+        return lambda x, u: _arc(x, u, model.dt)
+    rates = {"KinematicBicycle": _bicycle, "PlanarQuadrotor": _planar, "Quadrotor": _space}[kind]
+    return lambda x, u: _classical(lambda x: rates(model, x, u), x, model.dt, model.substeps)
+
+
+class ModelReferee:
+    """The firm problem over w = [X_1..N | U | n], with any number of obstacles.
+
+    Args:
+        problem: model, horizon, Q, R, Qf, u_min, u_max, robot_radius are read, and
+            `size.reference` where no `size` is given.
+        x0, x_ref: As in a control step.
+        obstacles: Predictions.
+        size: s of all obstacles.
+        bounds: Hard bounds x_min, x_max (nx,), du_min, du_max (nu,) on u_i - u_(i-1).
+        u_before: u_(-1); without it the first difference is free.
+        dynamics: The next state in CasADi, for a model that is not known here.
+    """
+
+    def __init__(
+        self, problem, x0, x_ref, obstacles, *, size=None, u_before=None, dynamics=None, **bounds
+    ) -> None:
+        self.problem, self.obstacles = problem, obstacles
+        self.size = float(problem.size.reference if size is None else size)
+        model, N = problem.model, problem.horizon
+        advance = dynamics or symbolic(model)
+        self.nx, self.nu, self.dim = model.nx, model.nu, len(model.position)
+        self.position = [int(i) for i in model.position]
+        X, U = casadi.SX.sym("X", self.nx, N), casadi.SX.sym("U", self.nu, N)
+        self.width = 1 if self.dim == 2 else 3
+        sides = casadi.SX.sym("n", self.width, N * len(obstacles))
+        weights = [casadi.DM(W) for W in (problem.Q, problem.Qf, problem.R)]
+        cost, rows, lower, upper = 0, [], [], []
+
+        def demand(row, low, high):
+            rows.append(row)
+            lower.append(np.broadcast_to(low, row.numel()))
+            upper.append(np.broadcast_to(high, row.numel()))
+
+        previous, idle = casadi.DM(x0), casadi.DM(model.idle)
+        for i in range(N):
+            error = X[:, i] - casadi.DM(x_ref[i + 1])
+            cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(weights[2], U[:, i] - idle)
+            demand(X[:, i] - advance(previous, U[:, i]), 0.0, 0.0)
+            previous = X[:, i]
+            before = U[:, i - 1] if i else (None if u_before is None else casadi.DM(u_before))
+            if before is not None and {"du_min", "du_max"} & set(bounds):
+                low, high = bounds.get("du_min", -np.inf), bounds.get("du_max", np.inf)
+                demand(U[:, i] - before, low, high)
+            for j, obstacle in enumerate(obstacles):
+                n = sides[:, j * N + i]
+                if self.dim == 2:
+                    n = casadi.vertcat(casadi.cos(n), casadi.sin(n))
+                else:
+                    demand(casadi.sumsqr(n), -np.inf, 1.0)
+                spread = casadi.sqrt(casadi.bilin(casadi.DM(obstacle.covariances[i + 1]), n))
+                delta = X[self.position, i] - casadi.DM(obstacle.means[i + 1])
+                reach = problem.robot_radius + obstacle.radius
+                demand(casadi.dot(n, delta) - self.size * spread, reach, np.inf)
+        w = casadi.vertcat(casadi.vec(X), casadi.vec(U), casadi.vec(sides))
+        self.nlp = {"x": w, "f": cost, "g": casadi.vertcat(*rows)}
+        self.rows = np.concatenate(lower), np.concatenate(upper)
+        free = np.full(sides.numel(), np.inf)
+        x_min, x_max = bounds.pop("x_min", -np.inf), bounds.pop("x_max", np.inf)
+        assert set(bounds) <= {"du_min", "du_max"}, bounds
+        self.box = tuple(
+            np.concatenate([np.tile(np.broadcast_to(x, self.nx), N), np.tile(u, N), sign * free])
+            for x, u, sign in ((x_min, problem.u_min, -1), (x_max, problem.u_max, 1))
+        )
+
+    def solve(self, X, U, near: bool) -> Verdict:
+        """Run IPOPT from a plan; `near` keeps the barrier small so that it stays close by."""
+        ipopt = _OPTIONS | (_NEAR if near else {})
+        solver = casadi.nlpsol("referee", "ipopt", self.nlp, {"print_time": False, "ipopt": ipopt})
+        result = solver(
+            x0=np.concatenate([X[1:].ravel(), U.ravel(), self._sides(X[1:, self.position])]),
+            lbx=self.box[0],
+            ubx=self.box[1],
+            lbg=self.rows[0],
+            ubg=self.rows[1],
+        )
+        w, N = np.array(result["x"]).ravel(), self.problem.horizon
+        ends = w[: N * self.nx].reshape(N, self.nx)
+        inputs = w[N * self.nx : N * (self.nx + self.nu)].reshape(N, self.nu)
+        ok = bool(solver.stats()["success"])
+        return Verdict(np.vstack([X[:1], ends]), inputs, float(result["f"]), ok)
+
+    def normals(self, positions: np.ndarray) -> np.ndarray:
+        """Outward normals (M, N, d) at positions (N, d), by search in ever smaller caps."""
+        rng = np.random.default_rng(0)
+        means = np.array([obstacle.means[1:] for obstacle in self.obstacles])
+        Sigma = np.array([obstacle.covariances[1:] for obstacle in self.obstacles])
+        delta = (positions - means)[:, :, None]
+        n, width = np.ones((*delta.shape[:2], 1, self.dim)), 1e3
+        for _ in range(40):
+            tries = n + width * rng.normal(size=(*delta.shape[:2], 400, self.dim))
+            tries[:, :, :1] = n
+            tries /= np.linalg.norm(tries, axis=-1, keepdims=True)
+            spread = np.sqrt(np.einsum("mnki,mnij,mnkj->mnk", tries, Sigma, tries))
+            best = np.argmax((tries * delta).sum(-1) - self.size * spread, axis=-1)
+            n = np.take_along_axis(tries, best[:, :, None, None], axis=2)
+            width = 0.5 * min(width, 1.0)
+        return n[:, :, 0]
+
+    def _sides(self, positions: np.ndarray) -> np.ndarray:
+        if not self.obstacles:
+            return np.zeros(0)
+        n = self.normals(positions)
+        return np.arctan2(n[..., 1], n[..., 0]).ravel() if self.dim == 2 else n.ravel()
+
+
+def _arc(x, u, dt):
+    """The unicycle by quadrature: exact to rounding while it turns by less than about 3 rad."""
+    nodes, weights = np.polynomial.legendre.leggauss(14)
+    p1, p2, theta, v = casadi.vertsplit(x)
+    a, omega = casadi.vertsplit(u)
+    for node, weight in zip(0.5 * dt * (nodes + 1), 0.5 * dt * weights, strict=True):
+        p1 += weight * (v + a * node) * casadi.cos(theta + omega * node)
+        p2 += weight * (v + a * node) * casadi.sin(theta + omega * node)
+    return casadi.vertcat(p1, p2, theta + dt * omega, v + dt * a)
+
+
+def _classical(rates, x, dt, substeps):
+    h = dt / substeps
+    for _ in range(substeps):
+        k1 = rates(x)
+        k2 = rates(x + h / 2 * k1)
+        k3 = rates(x + h / 2 * k2)
+        k4 = rates(x + h * k3)
+        x = x + h / 6 * k1 + h / 3 * k2 + h / 3 * k3 + h / 6 * k4
+    return x
+
+
+def _bicycle(model, x, u):
+    """Through the slip angle of the reference point, unlike the package."""
+    slip = casadi.atan(model.rear / model.wheelbase * casadi.tan(x[4]))
+    speed = x[3] / casadi.cos(slip)
+    return casadi.vertcat(
+        speed * casadi.cos(x[2] + slip),
+        speed * casadi.sin(x[2] + slip),
+        x[3] * casadi.tan(x[4]) / model.wheelbase,
+        u[0],
+        u[1],
+    )
+
+
+def _planar(model, x, u):
+    thrust = u[0] * casadi.vertcat(casadi.sin(x[2]), casadi.cos(x[2]))
+    return casadi.vertcat(x[3], x[4], x[5], thrust - casadi.DM([0.0, model.gravity]), u[1])
+
+
+def _space(model, x, u):
+    """By rotation matrices, and the Euler rates from the inverse of their map to body rates."""
+    roll, pitch, yaw = x[6], x[7], x[8]
+    c, s = casadi.cos, casadi.sin
+    about_x = casadi.vertcat(
+        casadi.horzcat(1, 0, 0),
+        casadi.horzcat(0, c(roll), -s(roll)),
+        casadi.horzcat(0, s(roll), c(roll)),
+    )
+    about_y = casadi.vertcat(
+        casadi.horzcat(c(pitch), 0, s(pitch)),
+        casadi.horzcat(0, 1, 0),
+        casadi.horzcat(-s(pitch), 0, c(pitch)),
+    )
+    about_z = casadi.vertcat(
+        casadi.horzcat(c(yaw), -s(yaw), 0),
+        casadi.horzcat(s(yaw), c(yaw), 0),
+        casadi.horzcat(0, 0, 1),
+    )
+    axis = casadi.mtimes([about_z, about_y, about_x, casadi.DM([0.0, 0.0, 1.0])])
+    body = casadi.horzcat(
+        casadi.DM([1.0, 0.0, 0.0]),
+        casadi.mtimes(about_x.T, casadi.DM([0.0, 1.0, 0.0])),
+        casadi.mtimes([about_x.T, about_y.T, casadi.DM([0.0, 0.0, 1.0])]),
+    )
+    euler = casadi.mtimes(casadi.inv(body), u[1:])
+    return casadi.vertcat(x[3:6], u[0] * axis - casadi.DM([0.0, 0.0, model.gravity]), euler)
