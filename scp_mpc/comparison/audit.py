@@ -59,13 +59,21 @@ def audit(
     over = max(float((U - problem.u_max).max()), float((problem.u_min - U).max()))
     if first or over > 1e-9:
         return Finding(invalid=f"an input is {over:.3g} beyond its limit")
+    change = np.diff(U, axis=0)
+    over = max((change - problem.du_max).max(initial=0), (problem.du_min - change).max(initial=0))
+    if over > 1e-8:
+        return Finding(invalid=f"a rate is {over:.3g} beyond its limit")
     if not plan.ok:
         return Finding()
     states = _states(problem, x0, U)
     defect = float(np.abs(states - plan.X).max())
     if not defect <= _TOLERANCE * max(1.0, float(np.abs(states).max())):
         return Finding(lie=f"{plan.status.name}: the states do not follow by {defect:.3g}")
-    positions = states[1:, problem.model.position]
+    x = states[1:]
+    over = max(float((x - problem.x_max).max()), float((problem.x_min - x).max()))
+    if over > _TOLERANCE * max(1.0, float(np.abs(states).max())):
+        return Finding(lie=f"{plan.status.name}: a state is {over:.3g} beyond its bound")
+    positions = x[:, problem.model.position]
     depth = _depth(problem, positions, obstacles, _sizes(problem, plan.s))
     if depth > 0:
         return Finding(lie=f"{plan.status.name}: a constraint is violated by {depth:.3g} m")

@@ -49,7 +49,8 @@ class Unknowns:
         upper: (size,) upper bounds, infinity for states.
 
     Raises:
-        InvalidArgumentError: The problem constrains points between the samples.
+        InvalidArgumentError: The problem constrains points between the samples, or bounds states
+            or rates.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -58,6 +59,7 @@ class Unknowns:
             raise InvalidArgumentError(
                 "problem.subsamples", f"{problem.subsamples}, but peers constrain the samples only"
             )
+        refuse_limits(problem)
         N, nx, nu = problem.horizon, problem.model.nx, problem.model.nu
         self._shapes = (N, nx), (N, nu)
         self.ends = N * nx, N * (nx + nu)
@@ -90,3 +92,23 @@ def require_round(obstacles: Sequence[ObstaclePrediction]) -> None:
             raise InvalidArgumentError(
                 f"obstacles[{j}].shape", f"{obstacle.shape!r}, but peers know ellipsoids only"
             )
+
+
+def refuse_limits(problem: Problem) -> None:
+    """Refuse bounds of states and of rates, which the peers' programs do not have.
+
+    Raises:
+        InvalidArgumentError: There are some.
+    """
+    if problem.limits_states:
+        at = int(problem.bounded_states[0])
+        name = "x_max" if np.isfinite(problem.x_max[at]) else "x_min"
+        bound = getattr(problem, name)[at]
+        raise InvalidArgumentError(
+            f"problem.{name}", f"{bound} for state {at}, but peers do not bound states"
+        )
+    if problem.limits_rates:
+        name = "du_max" if np.isfinite(problem.du_max).any() else "du_min"
+        raise InvalidArgumentError(
+            f"problem.{name}", f"{getattr(problem, name)}, but peers do not bound rates"
+        )

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.ipopt import import_casadi, parameters
-from scp_mpc.comparison.nlp import linear_model, require_round
+from scp_mpc.comparison.nlp import linear_model, refuse_limits, require_round
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -46,7 +46,7 @@ class Staged:
 
     Raises:
         PeerMissingError: CasADi is not installed.
-        InvalidArgumentError: Another solver, or the exact inflation.
+        InvalidArgumentError: Another solver, the exact inflation, or bounds of states or rates.
     """
 
     def __init__(self, problem: Problem, solver: str) -> None:
@@ -55,6 +55,7 @@ class Staged:
             raise InvalidArgumentError("solver", f"{solver!r} is none of {', '.join(SOLVERS)}")
         if problem.inflation != "axes":
             raise InvalidArgumentError("problem.inflation", f"{problem.inflation!r} is not 'axes'")
+        refuse_limits(problem)
         self.problem = problem
         casadi = import_casadi()
         program, equality = _program(casadi, problem)

@@ -21,8 +21,8 @@ def largest_violation(
     """Return the largest violation of any constraint; 0 for none, infinity for NaN.
 
     It is the largest, each in its own unit, of |x_0 - x0|, the defects |x_{i+1} - f(x_i, u_i)|,
-    what inputs and sizes exceed their bounds by, and the depth [m] inside a no-go set at the
-    plan's own s: -g of `scp_mpc.safety.inflation`.
+    what states, inputs, rates between intervals and sizes exceed their bounds by, and the depth [m]
+    inside a no-go set at the plan's own s: -g of `scp_mpc.safety.inflation`.
 
     Args:
         problem: Whose constraints.
@@ -34,11 +34,15 @@ def largest_violation(
     """
     model, margin = problem.model, problem.size
     reached = np.array([model.step(x, u) for x, u in zip(states[:-1], inputs, strict=True)])
+    change = np.diff(inputs, axis=0)
     amounts = [
         np.abs(states[0] - x0),
         np.abs(states[1:] - reached),
         problem.u_min - inputs,
         inputs - problem.u_max,
+        problem.excess(states),
+        np.maximum(0.0, change - problem.du_max),
+        np.maximum(0.0, problem.du_min - change),
         margin.lower - s,
         s - margin.upper,
     ]
