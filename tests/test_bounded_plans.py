@@ -7,16 +7,17 @@ import pytest
 from bounded_referee import Bounded
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instances import instance, obstacle, problem, straight_reference
+from instances import DT, instance, obstacle, problem, straight_reference
 from test_subproblem import dense
 
-from scp_mpc import MPC, SCP, InvalidArgumentError, Settings, Status
+from scp_mpc import MPC, SCP, Settings, Status
 from scp_mpc.comparison.audit import audit
-from scp_mpc.comparison.nlp import Unknowns
-from scp_mpc.comparison.staged import Staged
 from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.solver.iterate import Iterate, Multipliers
+from scp_mpc.solver.sampling import Sampling
+from scp_mpc.solver.sparse_scp import SparseSCP
 from scp_mpc.solver.step_data import StepData
+from scp_mpc.solver.stopwatch import Stopwatch
 from scp_mpc.solver.subproblem import Subproblem
 
 PATHS = (False,)
@@ -275,27 +276,43 @@ def test_closed_loops_keep_inputs_and_rates_always(condense, targets, steps, see
         x = this.model.step(x, last) + 0.02 * rng.normal(size=4)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"x_max": [INF, 2.0, INF, INF]}, "problem.x_max: 2.0 for state 1"),
-        ({"x_min": [-INF, -INF, -1.0, -INF]}, "problem.x_min: -1.0 for state 2"),
-        ({"du_min": [-1.0, -INF]}, "problem.du_min"),
-        ({"du_max": 1.0}, "problem.du_max"),
-    ],
-)
-def test_peers_refuse_what_they_do_not_bound(changes, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        Unknowns(problem(N, **changes))
-    with pytest.raises(InvalidArgumentError, match=message):
-        Staged(problem(N, "axes", **changes), "fatrop")
+def test_unpack_moves_inputs_into_rates():
+    this, rng = problem(N, du_min=-0.3, du_max=0.2), np.random.default_rng(0)
+    subproblem, last = Subproblem(this), np.array([1.0, -1.0])
+    subproblem.write_step(np.zeros(4), np.zeros((N + 1, 4)), last)
+    z = rng.normal(scale=3.0, size=len(subproblem.program.q))
+    U = subproblem.unpack(z, np.zeros(len(subproblem.program.lower))).inputs
+    change = np.diff(np.vstack([last, U]), axis=0)
+    assert (change >= -0.3 - 1e-9).all()
+    assert (change <= 0.2 + 1e-9).all()
 
 
-def test_the_audit_finds_rates_and_states_beyond_their_bounds():
-    this, ref = problem(N, du_max=0.5, du_min=-0.5, **SPEED), straight_reference(N)
-    plan = SCP(this, Settings(condense=False)).solve(ref[0], ref)
-    assert plan.ok
-    assert audit(this, ref[0], [], plan) == audit(problem(N), ref[0], [], plan)
-    fast = SCP(problem(N)).solve(ref[0], straight_reference(N, 4.0))
-    assert "a rate is" in audit(this, ref[0], [], fast).invalid
-    assert "a state is" in audit(problem(N, **SPEED), ref[0], [], fast).lie
+def test_the_merit_includes_the_price_of_the_excess():
+    this, ref = problem(N, u_min=-1.0, **SPEED), straight_reference(N, 3.0)
+    sparse = SparseSCP(this, Settings(condense=False), Sampling.of(this, 1))
+    sparse.begin(StepData.read(this, ref[0], ref, []), Stopwatch())
+    end = sparse.descend(sparse.free(), 10)
+    assert end.merit - end.cost == pytest.approx(100.0 * (0.8 + 0.6 + 0.4 + 0.2))
+
+
+@paths
+def test_bounds_hold_between_obstacles_that_are_constrained_between_samples(condense):
+    """At 6 m/s the robot passes through the radii in one interval."""
+    this = problem(N, subsamples=4, x_max=[INF, 6.0, 0.9, INF], du_min=-2.0, du_max=2.0)
+    mpc, x, last = MPC(this, Settings(condense=condense)), np.array([0, 6.0, 0, 0]), np.zeros(2)
+    ways = []
+    for k in range(8):
+        ref = straight_reference(N, 6.0) + [6.0 * DT * k, 0, 0, 0]
+        plan = mpc.step(x, ref, [obstacle(N, (6.0, -0.1), covariance=1e-3 * np.eye(2), growth=0.0)])
+        assert plan.ok
+        assert plan.x_slack.max() <= 1e-6
+        change = np.diff(np.vstack([last, plan.U]), axis=0)
+        assert (np.abs(change[k == 0 :]) <= 2.0 + 1e-9).all()  # at first u_last is not known
+        last = plan.u0
+        x = this.model.step(x, last)
+        ways.append((x[2], np.abs(change[1:]).max(), plan.slack.shape, plan.iterate.slack.shape))
+    y, most, shapes, points = zip(*ways, strict=True)
+    assert max(y) > 0.2
+    assert max(most) == pytest.approx(2.0)
+    assert set(shapes) == {(1, N)}
+    assert (1, 4 * N) in points

@@ -18,12 +18,17 @@ from scp_mpc import (
     NotFiniteError,
     Settings,
     ShapeError,
+    Status,
 )
+from scp_mpc.comparison.audit import audit
+from scp_mpc.comparison.nlp import Unknowns
+from scp_mpc.comparison.staged import Staged
 from scp_mpc.solver import Multipliers
 
 NAN, INF = np.nan, np.inf
 N = 8
 SPARSE = Settings(condense=False)
+SPEED = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -INF, -INF]}
 
 
 @pytest.mark.parametrize(
@@ -182,3 +187,42 @@ def test_a_bad_last_input_is_refused_and_leaves_no_trace(u_last, error, changes)
     assert same(plans[:3], plans[3:])
     with pytest.raises(error, match="u_last"):
         SCP(problem(N, **changes), SPARSE).solve(ref[0], ref, u_last=u_last)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x_max": [INF, 2.0, INF, INF]}, "problem.x_max: 2.0 for state 1"),
+        ({"x_min": [-INF, -INF, -1.0, -INF]}, "problem.x_min: -1.0 for state 2"),
+        ({"du_min": [-1.0, -INF]}, "problem.du_min"),
+        ({"du_max": 1.0}, "problem.du_max"),
+    ],
+)
+def test_peers_refuse_what_they_do_not_bound(changes, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Unknowns(problem(N, **changes))
+    with pytest.raises(InvalidArgumentError, match=message):
+        Staged(problem(N, "axes", **changes), "fatrop")
+
+
+def test_the_audit_finds_rates_and_states_beyond_their_bounds():
+    this, ref = problem(N, du_max=0.5, du_min=-0.5, **SPEED), straight_reference(N)
+    plan = SCP(this, SPARSE).solve(ref[0], ref)
+    assert plan.ok
+    assert audit(this, ref[0], [], plan) == audit(problem(N), ref[0], [], plan)
+    fast = SCP(problem(N)).solve(ref[0], straight_reference(N, 4.0))
+    assert "a rate is" in audit(this, ref[0], [], fast).invalid
+    assert "a state is" in audit(problem(N, **SPEED), ref[0], [], fast).lie
+
+
+def test_braking_keeps_rates_and_says_what_states_exceed():
+    this = problem(N, du_min=-0.4, du_max=0.4, u_min=-1.0, **SPEED)
+    start, last = np.array([0.0, 3.0, 0.0, 0.0]), np.array([0.5, 0.0])
+    plan = SCP(this).brake(start, np.zeros(4), u_last=last)
+    assert plan.status is Status.FALLBACK
+    change = np.diff(np.vstack([last, plan.U]), axis=0)
+    assert (np.abs(change) <= 0.4 + 1e-9).all()
+    np.testing.assert_allclose(plan.x_slack, this.excess(plan.X))
+    assert plan.x_slack.max() == pytest.approx(1.02)
+    assert plan.kkt.feasibility == pytest.approx(1.02)
+    assert SCP(this).brake([0, 1.0, 0, 0], np.zeros(4), u_last=[0, 0]).status is Status.BRAKING
