@@ -20,7 +20,7 @@ from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 from scp_mpc.solver.subproblem import Subproblem
 
-PATHS = (False,)
+PATHS = (False, True)
 INF = np.inf
 N = 8
 SPEED = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -INF, -INF]}
