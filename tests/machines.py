@@ -58,6 +58,8 @@ def machine_problem(name: str, horizon: int, **changes) -> Problem:
         "margin": Margin.fixed(SIZE),
         "subsamples": 1,
     }
+    if name == "bicycle":
+        values |= {"x_min": [-np.inf] * 4 + [-0.8], "x_max": [np.inf] * 4 + [0.8]}
     return Problem(model, **(values | changes))
 
 

@@ -82,7 +82,9 @@ class ModelReferee:
         previous, idle = casadi.DM(x0), casadi.DM(model.idle)
         for i in range(N):
             error = X[:, i] - casadi.DM(x_ref[i + 1])
-            cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(weights[2], U[:, i] - idle)
+            cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(
+                weights[2], U[:, i] - idle
+            )
             demand(X[:, i] - advance(previous, U[:, i]), 0.0, 0.0)
             previous = X[:, i]
             before = U[:, i - 1] if i else (None if u_before is None else casadi.DM(u_before))

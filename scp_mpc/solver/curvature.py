@@ -27,10 +27,12 @@ Notation:
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
+from scipy.linalg.lapack import dposv, dpotrf, dpotrs, dtrtri, dtrtrs
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.solver.active_set import Held
+from scp_mpc.solver.active_set import CondensedProgram, Held
+
+_LEAST_BEND = 0.1  # of a direction whose curvature is negative, or nearly none
 
 
 def summed(held: Held, bends: FloatArray, step: FloatArray) -> Held | None:
@@ -81,3 +83,42 @@ def newton_step(held: Held, step: FloatArray, W: FloatArray) -> Held | None:
         change, _ = dpotrs(held.factor, held.rows @ (W @ (step + z)))
         force[held.indices] += change
     return replace(held, v=held.v + z, force=force)
+
+
+def bent_program(
+    program: CondensedProgram, here: FloatArray, W: FloatArray
+) -> tuple[CondensedProgram, FloatArray, FloatArray]:
+    """Return the program with the Hessian I + W about `here`, in coordinates that make it I.
+
+    The model v'here + (v - here)'(I + W)(v - here) / 2 replaces |v|^2 / 2; directions in which it
+    bends the other way, or hardly, are held to a least curvature.
+
+    Args:
+        program: The convex program.
+        here: (nv,) the plan about which W was found.
+        W: (nv, nv).
+
+    Returns:
+        The program in w, and `centre` and `root` of v = centre + root w.
+    """
+    M = W.copy()
+    M.flat[:: len(M) + 1] += 1.0
+    L, info = dpotrf(M, lower=1, clean=1)
+    if info == 0:
+        root, _ = dtrtri(L, lower=1)
+        root = root.T
+    else:
+        values, vectors = np.linalg.eigh(M)
+        root = vectors / np.sqrt(np.maximum(np.abs(values), _LEAST_BEND))
+    centre = here - root @ (root.T @ here)
+    F, A = np.ascontiguousarray(program.F @ root), np.ascontiguousarray(program.A @ root)
+    away, beyond = program.F @ centre, program.A @ centre
+    bent = replace(
+        program,
+        F=F,
+        lower=program.lower - away,
+        upper=program.upper - away,
+        A=A,
+        b=program.b - beyond,
+    )
+    return bent, centre, root

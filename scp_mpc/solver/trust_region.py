@@ -12,6 +12,8 @@ change by; as constraints of the program its bounds push, so that no point that 
 certified.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray
@@ -20,7 +22,7 @@ from scp_mpc.solver.active_set import CondensedProgram, Held
 from scp_mpc.solver.certificate import Point, Pushed
 from scp_mpc.solver.condensed_step import CondensedStep, Yielding
 from scp_mpc.solver.conflicts import Conflicts, Tangent
-from scp_mpc.solver.curvature import newton_step
+from scp_mpc.solver.curvature import bent_program, newton_step
 from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.iterate import NEGLIGIBLE
 from scp_mpc.solver.search import ROUNDING, SURPLUS, End, Search
@@ -30,6 +32,8 @@ _ENOUGH = 0.01  # share of the predicted decrease that a trial must bring
 _SHRINK, _GROW = 0.3, 3.0
 _SMALLEST = 1e-8  # trust region, relative to the inputs' range, at which to give up
 _WEIGHT = 2.0  # of the merit's penalty over the largest force
+_FADING = 0.5  # of that weight from one program to the next, where forces allow
+_CLOSE = 1e-2  # KKT residual from which on its fall counts, whatever the merit does
 _NOISE = 1e-12  # of the merit, relative
 
 
@@ -90,14 +94,22 @@ class TrustRegion(Search):
                 watch.learn(task, began)
                 break
             program, held = solved
-            trial = self._trial(tangent or self._tangent(point), program, held)
-            better = trial.residuals.worst
-            if not self._accepted(point, trial, program, held, residual):
+            W = self._curvature(tangent or self._tangent(point), held)
+            held = self._bent(program, held, W)
+            trial = self._step.point(self._conflicts, held)
+            accepted = self._accepted(point, trial, program, held, W, residual)
+            if not accepted and trial.pushed is not None and np.isfinite(trial.cost):
+                other = self._corrected(program, held, trial.pushed.tangent)
+                if other is not None:
+                    trial = self._step.point(self._conflicts, other)
+                    accepted = self._accepted(point, trial, program, held, W, residual)
+            if not accepted:
                 self._shrink(point, held)
                 watch.learn(task, began)
                 if self._radius < _SMALLEST:
                     break
                 continue
+            better = trial.residuals.worst
             point, tangent, before, residual = trial, None, residual, better
             end = End(trial, held.active, self._cap, iteration)
             active = held.active
@@ -136,17 +148,48 @@ class TrustRegion(Search):
             program.upper[c.inputs] = np.minimum(program.upper[c.inputs], u + reach)
         return program
 
-    def _trial(self, tangent: Tangent | None, program: CondensedProgram, held: Held) -> Point:
-        """Roll out Newton's step, or the convex one where the active set is about to change."""
-        whole = self._newton(tangent, held)
-        if whole is not None and self._step.consistent(program, whole, ROUNDING):
-            held = whole
-        return self._step.point(self._conflicts, held)
+    def _bent(self, program: CondensedProgram, held: Held, W: FloatArray) -> Held:
+        """The program's solution with the curvature that the convex one leaves out.
 
-    def _newton(self, tangent: Tangent | None, held: Held) -> Held | None:
-        """Newton's step on the original problem's KKT conditions for an active set."""
-        step, chart, conflicts = self._step, self._step.chart, self._conflicts
+        Newton's step for its active set; or, where that is about to change, the solution of the
+        program with all curvature that keeps it convex.
+        """
+        whole = newton_step(held, held.v - self._chart_now.here, W)
+        if whole is not None and self._step.consistent(program, whole, ROUNDING):
+            return whole
+        return self._resolved(program, held, W)
+
+    def _resolved(self, program: CondensedProgram, held: Held, W: FloatArray) -> Held:
+        bent, centre, root = bent_program(program, self._chart_now.here, W)
+        with self._step.watch.solving:
+            other = self._step.solve(bent, held.active)
+        return held if other is None else replace(other, v=centre + root @ other.v)
+
+    def _corrected(self, program: CondensedProgram, held: Held, reached: Tangent) -> Held | None:
+        """The second-order correction: the least change that takes the active pairs back to g = 0.
+
+        A step bends away from its linearised constraints by its square, which the merit would hold
+        against it wherever it is, also next to the optimum (Maratos, 1978).
+        """
+        bounds = len(program.F)
+        pairs = held.indices >= bounds
+        if not pairs.any():
+            return None
+        rows = np.concatenate([program.F, program.A])[held.indices]
+        wanted = np.zeros(len(rows))
+        wanted[pairs] = -reached.g[held.indices[pairs] - bounds]
+        change, *_ = np.linalg.lstsq(rows, wanted)
+        return replace(held, v=held.v + change)
+
+    @property
+    def _chart_now(self) -> VaryingChart:
+        chart = self._step.chart
         assert isinstance(chart, VaryingChart)
+        return chart
+
+    def _curvature(self, tangent: Tangent | None, held: Held) -> FloatArray:
+        """W (nv, nv): what the convex program leaves out of the Lagrangian's second derivative."""
+        step, chart, conflicts = self._step, self._chart_now, self._conflicts
         bounds, bends, pushed = len(chart.boxed), np.zeros((0, len(held.v))), None
         force = held.force[bounds:]
         if conflicts is not None and tangent is not None:
@@ -161,30 +204,35 @@ class TrustRegion(Search):
         states[0] = step.data.x0
         states[1:] += rolled.deviations
         hessians = step.problem.model.curvature(states[:-1], rolled.inputs, -nu)
-        W = chart.curvature(hessians) - bends.T @ bends
-        return newton_step(held, held.v - chart.here, W)
+        return chart.curvature(hessians) - bends.T @ bends
 
     def _accepted(
-        self, point: Point, trial: Point, program: CondensedProgram, held: Held, residual: float
+        self,
+        point: Point,
+        trial: Point,
+        program: CondensedProgram,
+        held: Held,
+        W: FloatArray,
+        residual: float,
     ) -> bool:
         """Whether a trial brings enough of what its program predicted."""
         if not np.isfinite(trial.cost):
             return False
         problem = self._step.problem
         largest = float(np.abs(held.force[len(program.lower) :]).max(initial=0.0))
-        self._weight = min(max(self._weight, _WEIGHT * largest), problem.slack_weight)
+        weight = max(_FADING * self._weight, _WEIGHT * largest)
+        self._weight = min(weight, problem.slack_weight)
         if self._yields is Yielding.EVERYBODY:
             self._weight = problem.slack_weight
-        chart = self._step.chart
-        assert isinstance(chart, VaryingChart)
+        chart, d = self._chart_now, held.v - self._chart_now.here
         before, after = self._merit(point), self._merit(trial)
-        model = chart.least + float(held.v @ held.v) / 2 + program.penalty(held.v)
+        model = chart.least + float(held.v @ held.v + d @ W @ d) / 2 + program.penalty(held.v)
         predicted, actual = before - model, before - after
         if actual >= _ENOUGH * predicted - _NOISE * abs(before):
             if actual >= predicted / 2:
                 self._radius *= _GROW
             return True
-        return trial.residuals.worst <= residual / 2 < np.inf
+        return trial.residuals.worst <= residual / 2 <= _CLOSE
 
     def _merit(self, point: Point) -> float:
         """Cost and penalties on all violations, whoever is supposed to yield."""
