@@ -18,6 +18,8 @@ from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
 from scp_mpc.errors import ShapeError
 from scp_mpc.robots.model import Linearisation, Model, as_period, as_places
 
+_MOST_POWERS = 64
+
 
 @dataclass(frozen=True, eq=False)
 class LinearModel(Model):
@@ -149,7 +151,20 @@ class LinearModel(Model):
         rows = powers[place.reshape(np.shape(fraction)), : self.nx]
         return rows[..., : self.nx], rows[..., self.nx :]
 
+    @cached_property
+    def _known(self) -> dict[float, FloatArray]:
+        return {}
+
     def _power(self, fraction: float) -> FloatArray:
+        """[[A, B], [0, I]] ^ fraction; a solver asks for few, and they take milliseconds."""
+        power = self._known.get(fraction)
+        if power is None:
+            if len(self._known) >= _MOST_POWERS:
+                self._known.clear()
+            power = self._known[fraction] = self._new_power(fraction)
+        return power
+
+    def _new_power(self, fraction: float) -> FloatArray:
         nx, size = self.nx, self.nx + self.nu
         whole = np.eye(size)
         whole[:nx, :nx], whole[:nx, nx:] = self.A, self.B

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_number, frozen
-from scp_mpc.errors import BoundsError, InvalidArgumentError, JacobianError
+from scp_mpc.errors import BoundsError, InvalidArgumentError, JacobianError, ShapeError
 
 _STEP = float(np.finfo(np.float64).eps ** (1 / 3))
 
@@ -138,11 +138,15 @@ class Model(ABC):
             tolerance: Accepted difference, times the larger of 1 and the row's largest entry.
 
         Raises:
+            ShapeError: x or u has another width.
             JacobianError: With the worst entry's row and column and both numbers.
             NotFiniteError: The model returns NaN or infinity there.
         """
         states = as_array("x", x)
         inputs = as_array("u", u)
+        for name, array, size in (("x", states, self.nx), ("u", inputs, self.nu)):
+            if array.shape[-1:] != (size,):
+                raise ShapeError(name, f"shape {array.shape} does not fit (..., {size})")
         z = joined(states, inputs)
         given = self.linearise(states, inputs)
         found = differences(lambda z: self.advance(z[..., : self.nx], z[..., self.nx :]), z)
