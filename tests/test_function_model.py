@@ -160,6 +160,10 @@ def test_a_linear_model_moves_and_stops_as_it_says():
     x = model.state(np.array([1.0, 2.0]), np.array([3.0, -1.0]))
     np.testing.assert_allclose(x, [1, 2, 3, -1])
     np.testing.assert_allclose(model.advance(x, model.idle)[:2], [1.3, 1.9])
+    A = A - np.diag([0.02, 0.0, 0.0, 0.0])  # a position that leaks
+    model = LinearModel(A, model.B, dt, [0, 1])
+    x = model.state(np.array([1.0, 2.0]), np.array([3.0, -1.0]))
+    np.testing.assert_allclose(model.advance(x, model.idle)[:2], [1.3, 1.9])
     fractions = np.array([0.3, 1.0, 0.0])
     states = model.advance(x, np.ones(2), fractions)
     for fraction, state in zip(fractions, states, strict=True):

@@ -195,3 +195,22 @@ def test_only_planar_robots_with_a_nose_have_a_heading(name):
     assert not model.position.flags.writeable
     still = np.zeros(model.nx)
     np.testing.assert_allclose(model.step(still, model.idle), still, atol=1e-15)
+
+
+@pytest.mark.parametrize(("name", "start", "share"), [
+    ("planar quadrotor", 3, 12), ("quadrotor", 3, 10)])  # fmt: skip
+def test_a_brake_thrusts_by_what_its_axis_has_of_the_wanted_force(name, start, share):
+    model = MODELS[name]
+    x, _ = draw(model, np.random.default_rng(9))
+    x[start : start + model.dim] *= 0.5
+    still = np.zeros(model.nu)
+    one = np.eye(model.nu)[0]
+    velocity = slice(start, start + model.dim)
+    axis = (model.derivative(x, one) - model.derivative(x, still))[velocity]
+    force = -x[velocity] / (share * DT) - model.derivative(x, still)[velocity]
+    assert model.brake(x)[0] == pytest.approx(axis @ force)
+    far = x.copy()
+    far[velocity] = 50.0
+    assert np.isfinite(model.brake(far)).all()
+    if name == "quadrotor":
+        assert model.derivative(x, model.brake(x))[8] == pytest.approx(0.0, abs=1e-12)
