@@ -31,6 +31,9 @@ def test_the_unicycle_is_exact(omega):
     np.testing.assert_allclose(model.advance(x, u), expected, atol=1e-10)
     np.testing.assert_allclose(model.step(x, u), expected, atol=1e-10)
     model.check(x, u)
+    y = np.array([0.3, -1.2, 2.0, 0.5])
+    bent = Model.curvature(model, x, u, y)
+    np.testing.assert_allclose(model.curvature(x, u, y), bent, atol=1e-7)
 
 
 @pytest.mark.parametrize("which", [lambda dt, n: KinematicBicycle(dt, 2.5, 1.2, n),
