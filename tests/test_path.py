@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from scp_mpc import BoundsError, InvalidArgumentError, NotFiniteError, ShapeError
@@ -40,6 +40,7 @@ def drawn(kind, dim, rng):
 def test_progress_is_arc_length(path):
     s = np.linspace(0, path.length, 4001)
     t = path.tangents(s)
+    assume(path.curvatures(s).max() < 20)  # not nearly a cusp
     np.testing.assert_allclose(np.linalg.norm(t, axis=1), 1, atol=3e-8)
     way = np.linalg.norm(np.diff(path.positions(s), axis=0), axis=1)
     assert way.max() <= np.diff(s).max() * (1 + 3e-8)
@@ -158,7 +159,7 @@ BAD = {
     "there and back": (
         lambda: Path.spline([[0, 0], [1, 0], [0, 0]]),
         InvalidArgumentError,
-        "points: the spline turns on the spot between points [01] and",
+        "points: the spline turns on the spot between points (0 and 1|1 and 2)$",
     ),
     "radius": (lambda: Path.circle(-1.0), BoundsError, "radius: -1.0 is not positive"),
     "centre": (lambda: Path.circle(1.0, [0.0]), ShapeError, "centre"),

@@ -23,6 +23,7 @@ from scp_mpc.settings import require_positive
 
 _CUTS = 64  # pieces of a circle
 _UNIT = 1e-8  # how far |dp/ds| may be from one
+_CUSP = 1e-5  # the same where a spline nearly turns on the spot
 _FINEST = 512  # pieces between two points of a spline
 
 
@@ -84,10 +85,10 @@ def spline(points: ArrayLike, closed: bool) -> Pieces:
     while True:
         pieces = _by_length(curve, g, cuts)
         unit = np.abs(np.linalg.norm(_middle_tangents(pieces), axis=1) - 1)
-        if unit.max() <= _UNIT:
+        if unit.max() <= (_UNIT if cuts < _FINEST else _CUSP):
             return pieces
         if cuts >= _FINEST:
-            at = int(np.argmax(~(unit <= _UNIT))) // cuts
+            at = int(np.argmax(unit)) // (2 * cuts)
             raise InvalidArgumentError(
                 "points", f"the spline turns on the spot between points {at} and {at + 1}"
             )

@@ -39,8 +39,10 @@ class Path:
         self._powers[:-1, 1] = (order * c)[1:]
         self._powers[:-1, 2] = (order * self._powers[:, 1])[1:]
         self._begin, self._way = c[0], np.diff(self.knots)
-        ends = _horner(self._powers, self._way)
-        self._end, self._leaving = ends[0], ends[1]
+        end, self._leaving, _ = _horner(self._powers, self._way)
+        # At both ends of each piece, (p - x)' t = slope - tangent' x.
+        self._tangents = np.stack([self._powers[0, 1], self._leaving], axis=1)
+        self._slopes = np.sum(np.stack([c[0], end], axis=1) * self._tangents, axis=2)
 
     @classmethod
     def circle(
@@ -88,20 +90,25 @@ class Path:
 
     def positions(self, s: ArrayLike) -> FloatArray:
         """Positions (..., d) at progress s (...) [m]; an open path stays at its ends."""
-        return self.derivatives(s)[0]
+        return self.derivatives(s, 1)[0]
 
     def tangents(self, s: ArrayLike) -> FloatArray:
         """Unit tangents (..., d) at progress s (...); the one after a corner, at a corner."""
-        return self.derivatives(s)[1]
+        return self.derivatives(s, 2)[1]
 
     def curvatures(self, s: ArrayLike) -> FloatArray:
         """Curvatures (...) [1/m], not negative; zero at corners, which `corners` tells of."""
         return np.asarray(np.linalg.norm(self.derivatives(s)[2], axis=-1))
 
-    def derivatives(self, s: ArrayLike) -> FloatArray:
-        """Positions, tangents and curvature vectors (3, ..., d) at progress s (...)."""
+    def derivatives(self, s: ArrayLike, count: int = 3) -> FloatArray:
+        """Positions, tangents and curvature vectors (3, ..., d) at progress s (...), or the first.
+
+        Args:
+            s: [m].
+            count: How many of the three.
+        """
         k, h = self.pieces(s)
-        return _horner(self._powers[:, :, k], h)
+        return _horner(self._powers[:, :count, k], h)
 
     def corners(self) -> FloatArray:
         """Angles (K+1,) by which the tangent jumps at the knots [rad]."""
@@ -138,16 +145,18 @@ class Path:
             return low
         k, start = self._within(low, high)
         # Between two knots at which the distance falls and rises, it has a minimum.
-        falls = np.einsum("kd,kd->k", self._begin[k] - x, self._powers[1, 0, k])
-        rises = np.einsum("kd,kd->k", self._end[k] - x, self._leaving[k])
+        falls, rises = (self._slopes[k] - self._tangents[k] @ x).T
         near = (falls <= 0) & (rises >= 0)
         near[:-1] |= (falls[:-1] <= 0) & (falls[1:] >= 0)  # at a corner
-        near[[0, -1]] = True
+        near[0] = near[-1] = True
         k, start, falls, rises = k[near], start[near], falls[near], rises[near]
-        share = -falls / np.maximum(rises - falls, _FLATTEST * self._way[k])
-        h, gap2 = self._nearest(x, k, share * self._way[k], low - start, high - start)
+        way = self._way[k]
+        h = -falls / np.maximum(rises - falls, _FLATTEST * way) * way
+        h, gap2 = self._nearest(
+            x, k, h, np.maximum(low - start, 0.0), np.minimum(high - start, way)
+        )
         best = int(gap2.argmin())
-        return float(start[best] + h[best])
+        return min(max(float(start[best] + h[best]), low), high)
 
     def _within(self, low: float, high: float) -> tuple[IntArray, FloatArray]:
         """The pieces that touch a window, and the progress at which each begins."""
@@ -167,18 +176,15 @@ class Path:
     def _nearest(
         self, x: FloatArray, k: IntArray, h: FloatArray, low: FloatArray, high: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The nearest point of each piece k within its part of the window: h and |p - x|^2."""
-        powers = self._powers[:, :, k]
-        low, high = np.maximum(low, 0.0), np.minimum(high, self._way[k])
+        """The nearest point of each piece k between low and high: h and |p - x|^2."""
+        powers, gap2 = self._powers[:, :, k], h
         h = np.minimum(np.maximum(h, low), high)
-        gap2: FloatArray = np.zeros(len(k))
         for _ in range(_ITERATIONS):
-            p, t, c = _horner(powers, h)
-            gap = p - x
-            gap2 = np.einsum("kd,kd->k", gap, gap)
-            bend = np.maximum(1 + np.einsum("kd,kd->k", gap, c), _FLATTEST)
-            step = np.einsum("kd,kd->k", gap, t) / bend
-            after = np.minimum(np.maximum(h - step, low), high)
+            terms = _horner(powers, h)
+            terms[0] -= x
+            gap2, slope, bend = np.add.reduce(terms * terms[0], axis=-1)
+            after = h - slope / np.maximum(1 + bend, _FLATTEST)
+            after = np.minimum(np.maximum(after, low), high)
             moved, h = np.abs(after - h).max(), after
             if moved <= _SMALL:
                 break

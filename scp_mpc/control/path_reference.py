@@ -103,7 +103,7 @@ class PathReference:
         window = None if last is None else (last - self._retreat, last + self._reach)
         s = self.path.project(x[model.position], window)
         ahead, v = self.schedule.advance(s, self._times)
-        position, tangent, _ = self.path.derivatives(ahead)
+        position, tangent = self.path.derivatives(ahead, 2)
         heading = getattr(model, "heading", None)
         if heading is not None:
             v = np.maximum(v, _CREEP)
