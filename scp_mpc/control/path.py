@@ -15,7 +15,7 @@ from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
 from scp_mpc.control.curves import Pieces, circle, polyline, spline
 
 _ITERATIONS = 20  # of Newton's method for the nearest point; two or three are used
-_SMALL = 1e-5  # [m] a step after which the next would be of the order of its square
+_SMALL = 1e-4  # [m] a step after which the next would be of the order of its square
 _FLATTEST = 0.2  # least curvature of the squared distance that Newton's method divides by
 
 

@@ -32,7 +32,8 @@ class Preview:
         rows: L.
 
     Raises:
-        InvalidArgumentError: The terminal weight is not that of the Riccati equation.
+        InvalidArgumentError: The model is not linear, or the terminal weight not that of the
+            Riccati equation.
     """
 
     def __init__(self, problem: Problem, rows: int) -> None:
@@ -40,9 +41,9 @@ class Preview:
         self._problem, self._rows = problem, as_count("rows", rows)
         model = problem.model
         if not isinstance(model, LinearModel):
-            raise InvalidArgumentError("problem", f"{type(model).__name__} is not linear")
-        self._A = model.A
+            raise InvalidArgumentError("problem", f"{model!r} is not a LinearModel")
         S, self._moves = lqr_preview(model.A, model.B, problem.Q, problem.R, self._rows)
+        self._A = model.A
         away = float(np.abs(problem.Qf - S).max())
         if away > 1e-9 * np.abs(S).max():
             raise InvalidArgumentError(
@@ -58,9 +59,9 @@ class Preview:
             ShapeError: The reference is not N + 1 + L rows long.
             NotFiniteError: NaN or infinity.
         """
-        N = self._problem.horizon
-        rows = as_array("x_ref", x_ref, (N + 1 + self._rows, len(self._A)))
-        w = rows[N:-1] @ self._A.T - rows[N + 1 :]
+        N, A = self._problem.horizon, self._A
+        rows = as_array("x_ref", x_ref, (N + 1 + self._rows, len(A)))
+        w = rows[N:-1] @ A.T - rows[N + 1 :]
         folded = rows[: N + 1].copy()
         folded[N] -= np.einsum("jkl,jl->k", self._moves, w)
         return folded
