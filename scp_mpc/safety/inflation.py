@@ -77,6 +77,7 @@ class Inflation(ABC):
         whole = np.zeros((M, N, d + 1, d - 1))  # s moves a wall's faces without turning them
         whole[:, :, :d] = spaces.bend
         j = sets.shapes.others
+        j = j[sets.active[j]]
         if len(j):
             part = HalfSpaces(spaces.normal[j], spaces.slope[j], spaces.offset[j], spaces.value[j])
             whole[j] = self._bend(sets.taken(j), s[j], part)

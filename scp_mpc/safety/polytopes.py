@@ -28,6 +28,8 @@ from scp_mpc.safety.tangents import tangents
 
 _NONE = -1
 _TIE = 1e-9  # [m] of depths below two faces that count as one
+_ON_FACE = 1e-9  # relative; nearer to a face than that is on it
+_RIM = 0.9  # of the way from a face's middle to its rim
 _POINT = 1e-9  # [m] nearer than that to a corner counts as no nearer
 
 
@@ -108,6 +110,19 @@ class Polytopes:
     def distance(self, y: FloatArray) -> FloatArray:
         """Signed distance (M, N) of points (M, N, d) in the frames of polytopes [m]."""
         return self.nearest(y).distance
+
+    def over(self, face: int, y: FloatArray) -> FloatArray:
+        """Points (K, d) on a face of the first polytope, near to points (K, d), off its rim."""
+        k = self.kind[0]
+        n, b, V = self.normals[k], self.offsets[k], self.vertices[k]
+        centre = np.unique(V[b[face] - V @ n[face] <= _ON_FACE * np.abs(V).max()], axis=0).mean(0)
+        way = y - centre
+        way -= (way @ n[face])[:, None] * n[face]
+        speed, room = way @ n.T, b - n @ centre
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(speed > 0, room / speed, np.inf)
+        share[:, (n @ n[face]) > 1 - _ON_FACE] = np.inf
+        return centre + np.minimum(1.0, _RIM * share.min(axis=1))[:, None] * way
 
     def nearest(self, y: FloatArray, side: Callable[[], FloatArray] | None = None) -> Nearest:
         """Return signed distance, normal and curvature at points (M, N, d), for polytopes alone.

@@ -24,6 +24,7 @@ from scp_mpc.safety.walls import clearance, largest
 LEAST_RISK = 1e-12  # smaller risks are not told apart: s stays below 7.04
 _NEWTON = 20  # steps at most; each is a sound bound
 _CLOSE = 1e-9  # change of a size that ends them
+_TOUCH = 1e-6  # [m] the settings' tolerance: a certified plan may be so deep in what is certain
 
 
 def size_at_risk(risk: float | FloatArray) -> FloatArray:
@@ -69,7 +70,7 @@ def risk_bound(sets: NoGoSets, positions: FloatArray) -> FloatArray:
 def _over(room: FloatArray, width: FloatArray) -> FloatArray:
     """Standard deviations that fit into the room: all or none where there is no deviation."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.where(width > 0, room / width, np.where(room >= 0, np.inf, -np.inf))
+        return np.where(width > 0, room / width, np.where(room >= -_TOUCH, np.inf, -np.inf))
 
 
 def _ellipsoids_risk(sets: NoGoSets, positions: FloatArray) -> FloatArray:

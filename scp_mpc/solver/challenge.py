@@ -10,15 +10,26 @@ import numpy as np
 
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
-from scp_mpc.solver.descent import Descent
+from scp_mpc.solver.descent import Descent, Glimpse
 from scp_mpc.solver.engine import Engine
+from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Candidate
-from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
+from scp_mpc.solver.sides import (
+    MAX_CANDIDATES,
+    MOST_AMONG_WALLS,
+    Passing,
+    candidates,
+    same_way,
+    varied,
+)
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.stopwatch import Stopwatch
 
 # A rival must be better by this share, or the plan flickers between sides of equal cost.
 _HYSTERESIS = 0.001
+_BEAM = 3  # ways among polytopes that are varied
+_ROUNDS = 5  # of variations
+_ALIKE = 1e-6  # relative difference of merits that counts as none
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +64,8 @@ class Challenge:
 
     def run(self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent) -> Found:
         """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        most = watch.room("way", MAX_CANDIDATES, then=engine.sampling.first)
+        many = MAX_CANDIDATES if step.shapes is None else MOST_AMONG_WALLS
+        most = watch.room("way", many, then=engine.sampling.first)
         if not most:
             return Found(best)
         began = watch.elapsed
@@ -68,10 +80,14 @@ class Challenge:
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=False)  # fewer where time ran out
         )
+        rivals = self._settings.rivals
+        if step.shapes is not None:
+            starts = self._searched(engine, step, watch, present, starts)
+            rivals += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
         ranked = sorted(starts, key=lambda start: start.merit)  # ties keep their order
         # A plan with slack is followed by any without: then all ways are worth their time.
-        for start in ranked[: self._settings.rivals] if safe else ranked:
+        for start in ranked[:rivals] if safe else ranked:
             if (not safe and goal.status.ok) or not watch.affords(engine.sampling.first):
                 break
             if safe and same_way(step, Passing(start.path, start.touched), here):
@@ -80,3 +96,43 @@ class Challenge:
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         return Found(goal, tried, switched)
+
+    def _searched(
+        self,
+        engine: Engine,
+        step: StepData,
+        watch: Stopwatch,
+        present: Iterate,
+        starts: list[Glimpse],
+    ) -> list[Glimpse]:
+        """Among polytopes, which face to pass at which stage is a search: the best few ways of all.
+
+        Each is varied by one face at one stage, as long as that finds better ones.
+        """
+        beam, done = _best(starts), list[Glimpse]()
+        for _ in range(_ROUNDS):
+            paths = [
+                path
+                for way in beam
+                if not any(way is other for other in done)
+                for path in varied(step, Passing(way.path, way.touched), present.s)
+            ]
+            done += beam
+            most = watch.room("way", MOST_AMONG_WALLS, then=engine.sampling.first)
+            if not paths or not most:
+                break
+            began = watch.elapsed
+            more = engine.glimpses(present, paths[:most], firm=True)
+            watch.learn("way", began, len(more))
+            beam = _best([*beam, *more])
+        return beam or starts
+
+
+def _best(ways: list[Glimpse]) -> list[Glimpse]:
+    """The best few that can be followed and differ in cost."""
+    beam: list[Glimpse] = []
+    for way in sorted(ways, key=lambda way: way.merit):
+        alike = beam and way.merit - beam[-1].merit <= _ALIKE * way.merit
+        if len(beam) < _BEAM and np.isfinite(way.merit) and not alike:
+            beam.append(way)
+    return beam

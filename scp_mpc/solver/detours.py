@@ -13,11 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 from scp_mpc.safety.polytopes import Polytopes
 from scp_mpc.solver.step_data import StepData
 
 _COSINE = 0.9  # of the angle between two directions that count as one
+_TOUCH = 1e-9  # [m] less than that within is not within
 _PARALLEL = 1e-9  # cosine below which a face is never reached
 
 
@@ -70,46 +71,84 @@ class Ellipsoids:
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Polytopes; where a path leaves them, their faces are put forward by rho."""
+    """One or several polytopes (w of them), left together; their faces are put forward by rho."""
 
-    shape: Polytopes
-    means: FloatArray
-    rho: FloatArray
+    shapes: Polytopes
+    means: FloatArray  # (w, k, d)
+    rho: FloatArray  # (w, k)
 
     @classmethod
-    def of(cls, step: StepData, s: float, j: int, reach: slice) -> "Walls":
-        """Those of obstacle j at some points, at size s."""
+    def of(cls, step: StepData, s: FloatArray, slots: IntArray, reach: slice) -> "Walls":
+        """Those of some obstacles at some points, at sizes s (M,)."""
         assert step.shapes is not None
-        variances = np.linalg.eigvalsh(step.covariances[j, 1:][reach])[:, -1]
-        rho = step.radii[j, reach] + s * np.sqrt(np.maximum(variances, 0.0))
-        return cls(step.shapes.taken(np.array([j])), step.means[j, 1:][reach], rho)
+        variances = np.linalg.eigvalsh(step.covariances[slots, 1:][:, reach])[..., -1]
+        rho = step.radii[slots, reach] + s[slots, None] * np.sqrt(np.maximum(variances, 0.0))
+        return cls(step.shapes.taken(slots), step.means[slots, 1:][:, reach], rho)
 
     def faces(self, known: list[FloatArray]) -> list[FloatArray]:
-        """Normals of faces that are not nearly those known, nor each other: at most two a axis."""
+        """Normals of faces that are not nearly those known, nor each other: at most two an axis."""
         found: list[FloatArray] = []
-        for n in self.shape.normals[self.shape.kind[0]]:
+        for n in self.shapes.normals[self.shapes.kind[0]]:
             if len(found) < 2 * len(n) and all(n @ other < _COSINE for other in known + found):
                 found.append(n)
         return found
 
     def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
         """See `Body`."""
-        return self._out(path, np.broadcast_to(n, path.shape))
+        return self._out(path, n)
+
+    def apart(self, path: FloatArray, normals: FloatArray) -> FloatArray:
+        """The same, but out of each polytope towards a side of its own (w, d)."""
+        return self._out(path, normals[:, None])
 
     def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """See `Body`."""
-        away = self.shape.nearest((path - self.means)[None]).normal[0] + 0.5 * n
+        """See `Body`; away from the first one."""
+        first = self.shapes.taken(np.zeros(1, dtype=np.intp))
+        away = first.nearest((path - self.means[0])[None]).normal[0] + 0.5 * n
         return self._out(path, away / np.linalg.norm(away, axis=1, keepdims=True))
 
     def _out(self, path: FloatArray, along: FloatArray) -> FloatArray:
-        """Move what is within along unit vectors (k, d), through the first face on the way."""
-        y = (path - self.means)[None]
-        within = self.shape.distance(y)[0] < self.rho
-        speed = along @ self.shape.normals[self.shape.kind[0]].T
-        ahead = speed > _PARALLEL
-        room = self.rho[:, None] - self.shape.depths(y)[0]
-        way = np.where(ahead, room / np.where(ahead, speed, 1.0), np.inf).min(axis=1)
-        return path + np.where(within, way, 0.0)[:, None] * along
+        """Move what is within along unit vectors (w, k, d): out of one, and of what comes next."""
+        along = np.broadcast_to(along, self.means.shape)
+        speed = along @ np.swapaxes(self.shapes.normals[self.shapes.kind], 1, 2)
+        ahead, points = speed > _PARALLEL, np.arange(len(path))
+        for _ in self.means:
+            y = path - self.means
+            within = self.shapes.distance(y) < self.rho - _TOUCH
+            if not within.any():
+                break
+            room = self.rho[..., None] - self.shapes.depths(y)
+            way = np.where(ahead, room / np.where(ahead, speed, 1.0), np.inf).min(axis=2)
+            way = np.where(within, way, 0.0)
+            which = way.argmax(axis=0)
+            path = path + way[which, points][:, None] * along[which, points]
+        return path
+
+    def flips(self, path: FloatArray, touched: BoolArray, count: int) -> list[FloatArray]:
+        """Paths that pass one polytope at one stage by another face than a path (k, d) does.
+
+        What does not push the path need not be moved: to give it more room would gain nothing.
+
+        Args:
+            path: Positions.
+            touched: (w, k) which polytopes push it, at which points.
+            count: Points in a stage.
+        """
+        y = path - self.means
+        stages = touched.reshape(len(y), -1, count).any(axis=2)
+        found = []
+        for w, i in np.argwhere(stages).tolist():
+            at = slice(i * count, (i + 1) * count)
+            one = self.shapes.taken(np.array([w]))
+            normals = one.normals[one.kind[0]]
+            here = one.nearest(y[None, w, at]).normal[0, -1]
+            for f in np.unique(normals, axis=0, return_index=True)[1].tolist():
+                if normals[f] @ here < _COSINE:
+                    new = path.copy()
+                    over = one.over(f, y[w, at]) + self.rho[w, at, None] * normals[f]
+                    new[at] = self.means[w, at] + over
+                    found.append(new)
+        return found
 
 
 # tau, and how to leave the no-go set: as the free plan would, one stage later or earlier, two later

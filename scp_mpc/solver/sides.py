@@ -6,7 +6,8 @@ late, is a local optimum. A candidate is a path that need not obey the dynamics:
 ignores the obstacles; but during one conflict it is put off or brought forward by a stage or two of
 the relative motion and pushed out of the no-go set, and during the other conflicts it is the
 present plan. For an obstacle that crosses, the two sides are before it and behind it. Linearising
-about the path gives half-spaces on that side, sound as any.
+about the path gives half-spaces on that side, sound as any. Polytopes often stand together, as
+walls do: there are candidates that pass all of them on one side, the first few on either, or none.
 
 Notation:
     C                   points of the plan, K in each stage; K is not 1 between fast samples only
@@ -18,7 +19,7 @@ Notation:
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice, product
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from scp_mpc.solver.detours import WAYS, Ellipsoids, Walls
 from scp_mpc.solver.step_data import StepData
 
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
+MOST_AMONG_WALLS = 32  # the same where there are polytopes
 _AROUND = 3  # stages before and after a conflict that a candidate may change
 _STILL = 1e-6  # relative motion in one stage, over the distance, that counts as none
+_MIXED = 3  # polytopes whose sides are tried in all combinations
 _COSINE = 0.9  # of the angle between two directions that count as one side
 
 
@@ -86,10 +89,46 @@ def candidates(
         side
         for j in order
         for side in _ways(
-            step, free, _elsewhere(step, free, present, conflict, j), float(s[j]), j, conflict[j]
+            step, free, _elsewhere(step, free, present, conflict, j), s, j, conflict[j]
         )
     )
+    if step.shapes is not None:
+        together = _together(step, free, s, conflict, step.shapes.slots)
+        return list(islice(chain(together, ways), most))
     return list(islice(ways, most))
+
+
+def _together(
+    step: StepData, free: FloatArray, s: FloatArray, conflict: BoolArray, walls: IntArray
+) -> Iterator[Side]:
+    """Stay in front of the polytopes in conflict; or pass them, each on either side."""
+    hit = conflict[walls]
+    if not hit.any():
+        return
+    points = np.flatnonzero(hit.any(axis=0))
+    order = np.argsort(np.where(hit.any(axis=1), hit.argmax(axis=1), len(free)), kind="stable")
+    walls = walls[order]
+    j = int(walls[0])
+    v, normals = _directions(free - step.means[j, 1:], points, step.sampling.count)
+    waiting = free.copy()
+    waiting[points[0] :] = free[points[0] - 1] if points[0] else step.track[0]
+    yield Side(j, -v / np.linalg.norm(v), 0.0, waiting)
+    body = Walls.of(step, s, walls, slice(0, len(free)))
+    for n in normals if len(walls) > 1 else ():
+        yield Side(j, n, 0.0, body.aside(free, n))
+    for mixed in product(*[normals[:2]] * min(len(walls), _MIXED)):
+        if len(walls) > 1 and any(n is not mixed[0] for n in mixed):
+            # Those beyond the first few go with the last of them.
+            sides = np.array([*mixed, *[mixed[-1]] * (len(walls) - len(mixed))])
+            yield Side(j, mixed[0], 0.0, body.apart(free, sides))
+
+
+def varied(step: StepData, way: Passing, s: FloatArray) -> list[FloatArray]:
+    """Paths that pass one polytope at one stage by another face than a way does."""
+    assert step.shapes is not None
+    walls = step.shapes.slots
+    body = Walls.of(step, s, walls, slice(0, len(way.path)))
+    return body.flips(way.path, way.touched[walls], step.sampling.count)
 
 
 def _elsewhere(
@@ -133,7 +172,7 @@ def _ways(
     step: StepData,
     free: FloatArray,
     elsewhere: FloatArray,
-    s: float,
+    s: FloatArray,
     j: int,
     conflict: BoolArray,
 ) -> Iterator[Side]:
@@ -141,9 +180,9 @@ def _ways(
     points = _first_run(conflict, around)
     v, normals = _directions(free - step.means[j, 1:], points, K)
     reach = slice(max(points[0] - around, 0), points[-1] + around + 1)
-    body: Ellipsoids | Walls = Ellipsoids.of(step, s, j, reach)
+    body: Ellipsoids | Walls = Ellipsoids.of(step, float(s[j]), j, reach)
     if step.shapes is not None and step.shapes.kind[j] >= 0:
-        body = Walls.of(step, s, j, reach)
+        body = Walls.of(step, s, np.array([j]), reach)
         for n in body.faces(normals):
             path = elsewhere.copy()
             path[reach] = body.aside(free[reach], n)
