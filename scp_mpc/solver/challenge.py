@@ -62,9 +62,21 @@ class Challenge:
             return False
         return not best.status.ok or (due and best.iterate.touches)
 
-    def run(self, engine: Engine, step: StepData, watch: Stopwatch, best: Descent) -> Found:
-        """Rank the ways past the obstacles by one program each; descend from the best of them."""
-        many = MAX_CANDIDATES if step.shapes is None else MOST_AMONG_WALLS
+    def run(
+        self,
+        engine: Engine,
+        step: StepData,
+        watch: Stopwatch,
+        best: Descent,
+        fresh: bool = False,
+    ) -> Found:
+        """Rank the ways past the obstacles by one program each; descend from the best of them.
+
+        Among polytopes, a plan that is not `fresh` was searched for at the steps before: there are
+        no more candidates than elsewhere.
+        """
+        thorough = step.shapes is not None and (fresh or not best.status.ok)
+        many = MOST_AMONG_WALLS if thorough else MAX_CANDIDATES
         most = watch.room("way", many, then=engine.sampling.first)
         if not most:
             return Found(best)
@@ -81,7 +93,7 @@ class Challenge:
             for side, start in zip(sides, starts, strict=False)  # fewer where time ran out
         )
         rivals = self._settings.rivals
-        if step.shapes is not None:
+        if thorough:
             starts = self._searched(engine, step, watch, present, starts)
             rivals += _BEAM - 1  # some lead to where we are
         goal, switched = best, False

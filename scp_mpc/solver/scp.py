@@ -190,7 +190,7 @@ class SCP:
             wide = self._resolution.widened(engine, step, sweep)
             found = Found(engine.descend(start) or self._ladder.resort(wide, last))
             if self._challenge.wanted(found.best, challenge):
-                found = self._challenge.run(engine, wide, watch, found.best)
+                found = self._challenge.run(engine, wide, watch, found.best, last is None)
             found = replace(found, best=allocate(engine, wide, watch, found.best))
             ending = watch.elapsed
             found = self._rescue(engine, wide, last, found)
