@@ -14,6 +14,7 @@ from scp_mpc.obstacles import Polytope
 from scp_mpc.safety.polytopes import Polytopes
 
 seeds = st.integers(0, 2**32 - 1)
+some = settings(max_examples=30)
 dims = pytest.mark.parametrize("dim", [2, 3])
 CUBE = Polytope.box([2.0, 2.0, 2.0])
 
@@ -55,7 +56,7 @@ def slow(shape, y):
 
 
 @dims
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seed=seeds)
 def test_agrees_with_a_program_for_the_nearest_point(dim, seed):
     rng = np.random.default_rng(seed)
@@ -69,6 +70,7 @@ def test_agrees_with_a_program_for_the_nearest_point(dim, seed):
 
 
 @dims
+@some
 @given(seed=seeds)
 def test_no_direction_exceeds_it(dim, seed):
     """Also near corners and edges, where the nearest feature changes."""
@@ -84,6 +86,7 @@ def test_no_direction_exceeds_it(dim, seed):
 
 
 @dims
+@some
 @given(seed=seeds)
 def test_it_is_convex_and_its_gradient_is_the_unit_normal(dim, seed):
     rng = np.random.default_rng(seed)
@@ -102,6 +105,7 @@ def test_it_is_convex_and_its_gradient_is_the_unit_normal(dim, seed):
 
 
 @dims
+@some
 @given(seed=seeds)
 def test_the_curvature_is_the_derivative_of_the_normal(dim, seed):
     rng = np.random.default_rng(seed)
@@ -170,7 +174,7 @@ def test_between_two_faces_the_side_decides():
 
 
 @dims
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(seed=seeds)
 def test_half_spaces_make_the_polytope_they_bound(dim, seed):
     rng = np.random.default_rng(seed)
