@@ -1,6 +1,6 @@
 """What the controller is told about one moving obstacle."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,7 +82,7 @@ class ObstaclePrediction:
             _require_hashable(name)
         if shape is not None:
             _require_solid(shape, dim)
-        self._set(mu, Sigma, radius, stamp, name, shape, variances)
+        self._set(mu, Sigma, radius, stamp, name, shape, _deviations(variances))
 
     @classmethod
     def still(
@@ -114,8 +114,8 @@ class ObstaclePrediction:
     ) -> "ObstaclePrediction":
         """Return the same obstacle elsewhere, unchecked: for what follows from checked arrays."""
         moved = object.__new__(ObstaclePrediction)
-        variances = np.linalg.eigvalsh(covariances)
-        moved._set(means, covariances, self.radius, stamp, self.name, self.shape, variances)
+        spread = _deviations(np.linalg.eigvalsh(covariances))
+        moved._set(means, covariances, self.radius, stamp, self.name, self.shape, spread)
         return moved
 
     def _set(
@@ -126,9 +126,8 @@ class ObstaclePrediction:
         stamp: float | None,
         name: Hashable,
         shape: Solid | None,
-        variances: NDArray[np.floating],
+        spread: FloatArray,
     ) -> None:
-        spread = np.sqrt(np.maximum(variances[:, -1], 0.0))
         object.__setattr__(self, "means", frozen(means))
         object.__setattr__(self, "covariances", frozen(covariances))
         object.__setattr__(self, "radius", radius)
@@ -148,6 +147,11 @@ class ObstaclePrediction:
         return int(self.means.shape[1])
 
 
+def _deviations(variances: NDArray[np.floating]) -> FloatArray:
+    """Roots (...) of the largest eigenvalues of covariances, given all (..., d), ascending."""
+    return np.sqrt(np.maximum(variances[..., -1], 0.0))
+
+
 def _require_hashable(name: object) -> None:
     try:
         hash(name)
@@ -160,6 +164,30 @@ def _require_solid(shape: object, dim: int) -> None:
         raise InvalidArgumentError("shape", f"{shape!r} is not a Polytope")
     if shape.dim != dim:
         raise ShapeError("shape", f"{shape.dim}-dimensional, but the means are {dim}-dimensional")
+
+
+def unchecked_predictions(
+    means: FloatArray,
+    covariances: FloatArray,
+    radius: float,
+    stamp: float,
+    names: Sequence[Hashable],
+) -> list[ObstaclePrediction]:
+    """Return many predictions at once, unchecked: for what a tracker has made of checked arrays.
+
+    Args:
+        means: (n, N+1, d) [m], given away.
+        covariances: (n, N+1, d, d) [m^2], given away.
+        radius: Of each [m].
+        stamp: Time of row 0 [s].
+        names: n of them.
+    """
+    spreads = _deviations(np.linalg.eigvalsh(covariances))
+    made = []
+    for mu, Sigma, spread, name in zip(means, covariances, spreads, names, strict=True):
+        made.append(object.__new__(ObstaclePrediction))
+        made[-1]._set(mu, Sigma, radius, stamp, name, None, spread)
+    return made
 
 
 def as_predictions(obstacles: object) -> tuple[ObstaclePrediction, ...]:
