@@ -1,0 +1,269 @@
+"""A tracker: measured positions, noisy and at any times, become predictions for the controller.
+
+Every motion's Kalman filter runs for every track, in one stack; see `imm` and `foresight`.
+Nothing changes before the last line of an update: one that raises leaves no trace.
+"""
+
+from collections.abc import Hashable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    as_count,
+    as_number,
+    require_positive_semidefinite,
+)
+from scp_mpc.errors import (
+    BoundsError,
+    CovarianceError,
+    InvalidArgumentError,
+    ShapeError,
+    StaleDataError,
+)
+from scp_mpc.obstacles.association import associate
+from scp_mpc.obstacles.foresight import Foresight
+from scp_mpc.obstacles.imm import Beliefs, MotionBank
+from scp_mpc.obstacles.kalman import Gaussians
+from scp_mpc.obstacles.prediction import ObstaclePrediction, unchecked_predictions
+from scp_mpc.obstacles.tracker_settings import TrackerSettings
+from scp_mpc.settings import require_positive
+
+_TICK = 1e-9  # [s]
+
+
+class _Tracks(NamedTuple):
+    """All tracks at one time: names, beliefs, number of measurements, time of the last [s]."""
+
+    names: tuple[Hashable, ...]
+    beliefs: Beliefs
+    hits: IntArray
+    seen: FloatArray
+
+    def at(self, index: IntArray) -> "_Tracks":
+        if len(index) == len(self.names):  # ascending: these are all
+            return self
+        names = tuple(self.names[i] for i in index)
+        return _Tracks(names, self.beliefs.at(index), self.hits[index], self.seen[index])
+
+    def joined(self, others: "_Tracks") -> "_Tracks":
+        if not others.names:
+            return self
+        return _Tracks(
+            self.names + others.names,
+            self.beliefs.joined(others.beliefs),
+            np.concatenate([self.hits, others.hits]),
+            np.concatenate([self.seen, others.seen]),
+        )
+
+
+class Tracker:
+    """Follows any number of obstacles and predicts each as a Gaussian along the horizon.
+
+    Measurements may come at any times, as long as these increase, and any of them may be missing.
+    With names, identities are known; without, measurements are paired with tracks (see
+    `association`), and what is left begins new ones, which are called 0, 1, 2, ...
+
+    Args:
+        dt: Interval of the predictions [s], the robot's.
+        horizon: N, number of their intervals.
+        radius: Of each obstacle [m].
+        measurement_std: Standard deviation of each coordinate of a measurement [m].
+        dim: Dimension of the workspace, 2 or 3.
+        settings: How obstacles move, and when tracks begin and end.
+
+    Raises:
+        InvalidArgumentError: Or one of its subclasses, with the argument and the number.
+    """
+
+    def __init__(
+        self,
+        dt: float,
+        horizon: int,
+        *,
+        radius: float,
+        measurement_std: float,
+        dim: int = 2,
+        settings: TrackerSettings | None = None,
+    ) -> None:
+        """Set up the matrices; there is no track yet."""
+        require_positive("dt", dt)
+        require_positive("measurement_std", measurement_std)
+        if as_number("radius", radius) < 0:
+            raise BoundsError("radius", f"{radius} m is negative")
+        if isinstance(dim, float) or dim not in (2, 3):
+            raise InvalidArgumentError("dim", f"{dim!r} is neither 2 nor 3")
+        self.settings = TrackerSettings() if settings is None else settings
+        if not isinstance(self.settings, TrackerSettings):
+            raise InvalidArgumentError("settings", f"{settings!r} is not a TrackerSettings")
+        self._noise = float(measurement_std) ** 2 * np.eye(dim)
+        self._radius, self._dim = float(radius), dim
+        self._gate = self.settings.gate_at(dim)
+        self._bank = MotionBank(self.settings.motions, self.settings.sojourn, dim)
+        self._foresight = Foresight(self._bank, as_count("horizon", horizon), float(dt))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all tracks and the time."""
+        d = self._dim
+        self._tracks = self._begun((), np.zeros((0, d)), np.zeros((0, d, d)), 0.0)
+        self._time: float | None = None
+        self._named: bool | None = None
+        self._born = 0
+
+    @property
+    def time(self) -> float | None:
+        """Time of the last update [s]; None before the first."""
+        return self._time
+
+    @property
+    def names(self) -> tuple[Hashable, ...]:
+        """Names of all tracks as of the last update, the unconfirmed ones among them."""
+        return self._tracks.names
+
+    def estimates(self) -> Gaussians:
+        """States [p, v] as of the last update, in the order of `names`: (n, 2 d), (n, 2 d, 2 d)."""
+        return self._tracks.beliefs.moments()
+
+    def update(
+        self,
+        time: float,
+        positions: ArrayLike,
+        names: Iterable[Hashable] | None = None,
+        covariances: ArrayLike | None = None,
+    ) -> tuple[Hashable, ...]:
+        """Take in all that was measured at one time; return the name of each one's track.
+
+        Args:
+            time: Of the measurements [s], after that of the last update.
+            positions: (n, d) [m]; none is possible, too: `[]`.
+            names: Who they are, n different ones; None where that is not known.
+            covariances: (n, d, d) or (d, d) of their errors [m^2], positive definite;
+                `measurement_std` squared if None.
+
+        Raises:
+            StaleDataError: `time` is not after the last update's.
+            NotFiniteError: NaN or infinity. A missing measurement is left out, not NaN.
+            InvalidArgumentError: A name is given twice, or names are given now and not before.
+        """
+        now = self._later(time)
+        z = as_array("positions", positions, (-1, self._dim), (0,)).reshape(-1, self._dim)
+        R = self._errors(covariances, len(z))
+        given = None if names is None else _distinct(names, len(z))
+        if self._named is not None and self._named != (given is not None):
+            before, after = ("with", "without") if self._named else ("without", "with")
+            raise InvalidArgumentError("names", f"measurements came {before} names, now {after}")
+        tracks = self._moved(now)
+        old, new = self._pairs(tracks, z, R, given)
+        taken = np.zeros(len(z), np.bool_)
+        taken[new] = True
+        fresh = np.flatnonzero(~taken)
+        if given is None:
+            called: tuple[Hashable, ...] = tuple(range(self._born, self._born + len(fresh)))
+        else:
+            called = tuple(given[k] for k in fresh)
+        later = self._corrected(tracks, old, z[new], R[new], now)
+        later = later.joined(self._begun(called, z[fresh], R[fresh], now))
+        self._time, self._named, self._tracks = now, given is not None, later
+        self._born += len(fresh)
+        whose = dict(zip(new, (tracks.names[i] for i in old), strict=True))
+        whose |= dict(zip(fresh, called, strict=True))
+        return tuple(whose[k] for k in range(len(z)))
+
+    def predictions(self, time: float | None = None) -> list[ObstaclePrediction]:
+        """Return what is predicted of each confirmed track, stamped and named.
+
+        Row 0 is at `time`, with all that is known by then: tracks that were not measured of late
+        are moved on, and less certain for it, until they end.
+
+        Args:
+            time: Of row 0 [s]; that of the last update if None.
+
+        Raises:
+            StaleDataError: `time` is before the last update's.
+        """
+        now = self._time if time is None else as_number("time", time)
+        if self._time is None or now is None:
+            return []
+        if now < self._time - _TICK:
+            raise StaleDataError("time", f"{now} s is before the last update's {self._time} s")
+        tracks = self._moved(max(now, self._time))
+        tracks = tracks.at(np.flatnonzero(tracks.hits >= self.settings.confirm))
+        means, Sigma = self._foresight.positions(tracks.beliefs)
+        Sigma *= self.settings.spread**2
+        return unchecked_predictions(means, Sigma, self._radius, now, tracks.names)
+
+    def _later(self, time: float) -> float:
+        now = as_number("time", time)
+        if self._time is not None and now <= self._time + _TICK:
+            raise StaleDataError("time", f"{now} s is not after the last update's {self._time} s")
+        return now
+
+    def _errors(self, covariances: ArrayLike | None, count: int) -> FloatArray:
+        """Covariances (n, d, d) of the measurements' errors."""
+        if covariances is None:
+            return np.broadcast_to(self._noise, (count, *self._noise.shape))
+        d = self._dim
+        R = as_array("covariances", covariances, (count, d, d), (d, d))
+        variances = require_positive_semidefinite("covariances", R.reshape(-1, d, d))
+        if variances.size and variances.min() <= 0:
+            raise CovarianceError("covariances", "a measurement without error: singular")
+        return np.broadcast_to(R, (count, d, d))
+
+    def _moved(self, now: float) -> _Tracks:
+        """The tracks that have not ended by then, moved on without measurements."""
+        alive = np.flatnonzero(now - self._tracks.seen <= self.settings.keep + _TICK)
+        tracks = self._tracks.at(alive)
+        if self._time is None or now == self._time or not tracks.names:
+            return tracks
+        return tracks._replace(beliefs=self._bank.predict(tracks.beliefs, now - self._time))
+
+    def _pairs(
+        self, tracks: _Tracks, z: FloatArray, R: FloatArray, given: tuple[Hashable, ...] | None
+    ) -> tuple[IntArray, IntArray]:
+        """Indices of tracks and of the measurements that belong to them."""
+        if given is None:
+            return associate(tracks.beliefs.moments(), z, R, self._gate)
+        places = {name: i for i, name in enumerate(tracks.names)}
+        new = np.array([k for k, name in enumerate(given) if name in places], np.intp)
+        return np.array([places[given[k]] for k in new], np.intp), new
+
+    def _corrected(
+        self, tracks: _Tracks, old: IntArray, z: FloatArray, R: FloatArray, now: float
+    ) -> _Tracks:
+        """The tracks after measurements (n, d) of those that `old` tells."""
+        if not len(old):
+            return tracks
+        beliefs = tracks.beliefs.replaced(old, self._bank.correct(tracks.beliefs.at(old), z, R))
+        hits, seen = tracks.hits.copy(), tracks.seen.copy()
+        hits[old] += 1
+        seen[old] = now
+        return _Tracks(tracks.names, beliefs, hits, seen)
+
+    def _begun(
+        self, names: tuple[Hashable, ...], z: FloatArray, R: FloatArray, now: float
+    ) -> _Tracks:
+        """New tracks from one measurement each."""
+        beliefs = self._bank.begin(z, R, self.settings.speed)
+        return _Tracks(names, beliefs, np.ones(len(z), np.intp), np.full(len(z), now))
+
+
+def _distinct(names: Iterable[Hashable], count: int) -> tuple[Hashable, ...]:
+    """The names as a tuple, of which each is hashable and given once."""
+    if isinstance(names, str | bytes) or not isinstance(names, Iterable):
+        raise InvalidArgumentError("names", f"{names!r} is not a list of names")
+    given = tuple(names)
+    if len(given) != count:
+        raise ShapeError("names", f"{len(given)} for {count} measurements")
+    seen: set[Hashable] = set()
+    for k, name in enumerate(given):
+        if name is None or not isinstance(name, Hashable):
+            raise InvalidArgumentError(f"names[{k}]", f"{name!r} cannot be a name")
+        if name in seen:
+            raise InvalidArgumentError(f"names[{k}]", f"{name!r} is given twice")
+        seen.add(name)
+    return given
