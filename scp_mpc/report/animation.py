@@ -29,7 +29,7 @@ def write_animation(run: ClosedLoop, path: Path) -> Path:
     steps = range(max(closest - _BEFORE, 0), min(closest + _AFTER, run.steps))
     figure, scenes = _stage(run, steps.start, closest)
     title = figure.text(0.06, 0.945, "", fontsize=12)
-    writer = _OnePalette(fps=_FRAMES_PER_SECOND)
+    writer = OnePaletteWriter(fps=_FRAMES_PER_SECOND)
     with writer.saving(figure, str(path), _DPI):
         for k in steps:
             status = run.plans[k].status
@@ -40,7 +40,7 @@ def write_animation(run: ClosedLoop, path: Path) -> Path:
     return path
 
 
-class _OnePalette(PillowWriter):
+class OnePaletteWriter(PillowWriter):
     """Gives all frames the same colours, so that what stands still costs nothing: half the size."""
 
     _frames: list[Any]
