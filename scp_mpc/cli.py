@@ -1,19 +1,50 @@
-"""The command line: `scp-mpc report` and `scp-mpc bench`. The only file that prints."""
+"""The command line: `scp-mpc report`, `bench`, `coverage`, `replay`. The only file that prints."""
 
+import json as json_format
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
-from scp_mpc import Margin, ScpMpcError, Settings, __version__
+from scp_mpc import Containment, Margin, ScpMpcError, Settings, __version__
 from scp_mpc.arrays import as_count
-from scp_mpc.errors import BoundsError
+from scp_mpc.errors import BoundsError, InvalidArgumentError
+from scp_mpc.obstacles import TrackerSettings
 from scp_mpc.problem import Problem
-from scp_mpc.report import COLUMNS, write_animation, write_figures, write_summary
-from scp_mpc.simulation import SCENARIOS, STEPS, ClosedLoop, simulate
+from scp_mpc.report import (
+    COLUMNS,
+    coverage_figure,
+    coverage_numbers,
+    coverage_table,
+    replay_figure,
+    replay_table,
+    save,
+    summarise_replay,
+    write_animation,
+    write_figures,
+    write_replay_animation,
+    write_summary,
+)
+from scp_mpc.simulation import (
+    SCENARIOS,
+    STEPS,
+    TRACKING,
+    ClosedLoop,
+    Crossing,
+    Recording,
+    control_steps,
+    find_meetings,
+    measure_coverage,
+    read_recording,
+    replay_problem,
+    simulate,
+)
+from scp_mpc.simulation import replay as run_replay
 
 try:
     import typer
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from tqdm import tqdm
@@ -100,6 +131,133 @@ def bench(
         if seed < 0:
             raise BoundsError("seed", f"{seed} is negative")
         horizon_timing.main(json, out, steps, seed, echo=typer.echo)
+
+
+_File = Annotated[
+    Path, typer.Argument(help="Recording: OpenTraj's obsmat.txt, or text: frame id x y.")
+]
+_Rate = Annotated[
+    float | None,
+    typer.Option(help="Frame numbers per second; 25, or what makes text's frames 0.4 s apart."),
+]
+_Layout = Annotated[
+    str | None, typer.Option(help='"obsmat" or "text"; told from the columns if not given.')
+]
+_Noise = Annotated[float, typer.Option(help="Standard deviation of the measurements' errors [m].")]
+_Spread = Annotated[float, typer.Option(help="Factor on the standard deviations of predictions.")]
+
+
+@app.command()
+def coverage(
+    file: _File,
+    rate: _Rate = None,
+    layout: _Layout = None,
+    noise: _Noise = 0.05,
+    seed: Annotated[int, typer.Option(help="Seed of the errors.")] = 0,
+    spread: _Spread = 1.0,
+    json: Annotated[Path | None, typer.Option(help="File for the numbers.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="File for the figure, PNG.")] = None,
+) -> None:
+    """Count how often recorded people are where the tracker said that they would be."""
+    with _one_line_errors():
+        settings = TrackerSettings(spread=spread)
+        recording = _recording(file, rate, layout)
+        with tqdm(total=len(recording.times), unit="frame") as bar:
+            found = measure_coverage(
+                recording, noise=noise, seed=seed, settings=settings, advance=bar.update
+            )
+        header, *rows = coverage_table(found)
+        table = Table(*header, box=SIMPLE_HEAD, padding=(0, 0))
+        for column in table.columns:
+            column.justify = "right"
+        for row in rows:
+            table.add_row(*row)
+        Console(markup=False).print(table)
+        typer.echo(
+            "Predicted: the RMS error that the covariances tell. NEES: 2 is right. ±: one "
+            "standard error."
+        )
+        if json is not None:
+            _write_json(coverage_numbers(found), json)
+        if figure is not None:
+            typer.echo(f"Written to {save(coverage_figure(found), figure)}")
+
+
+@app.command()
+def replay(
+    file: _File,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory for replay.json, replay.png and replay.gif.")
+    ] = None,
+    rate: _Rate = None,
+    layout: _Layout = None,
+    course: Annotated[str, typer.Option(help='The main flow: "along" it or "across".')] = "along",
+    start: Annotated[
+        tuple[float, float] | None, typer.Option(help="Where the robot starts [m]; with --goal.")
+    ] = None,
+    goal: Annotated[tuple[float, float] | None, typer.Option(help="Where to [m].")] = None,
+    speed: Annotated[float, typer.Option(help="Of the robot's reference [m/s].")] = 1.3,
+    horizon: Annotated[int, typer.Option(help="Intervals of 0.2 s to plan ahead.")] = 15,
+    level: Annotated[
+        float, typer.Option(help="Share of positions that the ellipses to avoid are to hold.")
+    ] = 0.95,
+    obstacles: Annotated[int, typer.Option(help="How many of the nearest people count.")] = 20,
+    noise: _Noise = 0.05,
+    seed: Annotated[int, typer.Option(help="Seed of the errors.")] = 0,
+    spread: _Spread = 1.0,
+    steps: Annotated[
+        int | None, typer.Option(help="Control steps of 0.2 s; to the recording's end.")
+    ] = None,
+    animation: Annotated[bool, typer.Option(help="Write the animated GIF too.")] = True,
+) -> None:
+    """Drive a robot through a recorded crowd, there and back again."""
+    with _one_line_errors():
+        if (start is None) != (goal is None):
+            raise InvalidArgumentError("start", "goes with a goal, and a goal with a start")
+        settings = replace(TRACKING, spread=spread)
+        problem = replay_problem(horizon, Containment(level), obstacles)
+        recording = _recording(file, rate, layout)
+        if start is not None and goal is not None:
+            crossing = Crossing(start, goal, speed)
+        else:
+            way = cast(Literal["along", "across"], course)  # the crossing checks it
+            crossing = Crossing.through(recording, way, speed)
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+        with tqdm(total=control_steps(recording, steps), unit="step") as bar:
+            run = run_replay(
+                *(recording, crossing, problem),
+                noise=noise,
+                seed=seed,
+                steps=steps,
+                tracker_settings=settings,
+                advance=bar.update,
+            )
+        meetings = find_meetings(run)
+        numbers = summarise_replay(run, meetings)
+        table = Table(show_header=False)
+        for name, value in replay_table(numbers):
+            table.add_row(name, value)
+        Console(markup=False).print(table)
+        typer.echo("People walk as they were recorded: they do not react to the robot.")
+        if out is not None:
+            _write_json(numbers, out / "replay.json")
+            typer.echo("Drawing ...")
+            written = [save(replay_figure(run, meetings), out / "replay.png")]
+            if animation:
+                written.append(write_replay_animation(run, out / "replay.gif"))
+            typer.echo(f"Written to {out}: {', '.join(path.name for path in written)}")
+
+
+def _recording(file: Path, rate: float | None, layout: str | None) -> Recording:
+    form = cast(Literal["obsmat", "text"] | None, layout)  # the reader checks it
+    return read_recording(file, rate=rate, layout=form)
+
+
+def _write_json(numbers: dict[str, Any], file: Path) -> None:
+    text = json_format.dumps(numbers, indent=2, allow_nan=False) + "\n"
+    file.write_text(text, encoding="utf-8")
+    typer.echo(f"Written to {file}")
 
 
 def _simulate_all(

@@ -1,17 +1,31 @@
 """Report: the tables, figures and the animation of closed-loop runs."""
 
 from scp_mpc.report.animation import write_animation
+from scp_mpc.report.canvas import save
+from scp_mpc.report.coverage_figure import coverage_figure
+from scp_mpc.report.coverage_table import coverage_numbers, coverage_table
 from scp_mpc.report.figures import FIGURES, write_figures
+from scp_mpc.report.replay_animation import write_replay_animation
+from scp_mpc.report.replay_figure import replay_figure
+from scp_mpc.report.replay_summary import replay_table, summarise_replay
 from scp_mpc.report.summary import summarise, summarise_all, write_summary
 from scp_mpc.report.table import COLUMNS, markdown_table
 
 __all__ = [
     "COLUMNS",
     "FIGURES",
+    "coverage_figure",
+    "coverage_numbers",
+    "coverage_table",
     "markdown_table",
+    "replay_figure",
+    "replay_table",
+    "save",
     "summarise",
     "summarise_all",
+    "summarise_replay",
     "write_animation",
     "write_figures",
+    "write_replay_animation",
     "write_summary",
 ]

@@ -1,23 +1,45 @@
-"""Simulation: named scenarios, the closed loop, obstacles drawn from predictions, contact."""
+"""Simulation: scenarios, the closed loop, obstacles drawn from predictions, recorded crowds."""
 
 from scp_mpc.simulation.closed_loop import ClosedLoop, simulate
 from scp_mpc.simulation.contact import contacts, robot_path, sampled_contacts
+from scp_mpc.simulation.coverage import LEVELS, Coverage, LeadCoverage, measure_coverage
+from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance
+from scp_mpc.simulation.meetings import Meeting, find_meetings
 from scp_mpc.simulation.realisations import COUPLINGS, applicable_couplings, sample_paths
+from scp_mpc.simulation.recording import Recording
+from scp_mpc.simulation.recordings import RecordingError, read_recording
+from scp_mpc.simulation.replay import TRACKING, Pass, Replay, control_steps, replay, replay_problem
 from scp_mpc.simulation.scenarios import DT, SCENARIOS, STEPS, Scenario
 
 __all__ = [
     "COUPLINGS",
     "DT",
+    "LEVELS",
     "SCENARIOS",
     "STEPS",
+    "TRACKING",
     "ClosedLoop",
     "CorrelatedDisturbance",
+    "Coverage",
+    "Crossing",
     "Crowd",
+    "LeadCoverage",
+    "Meeting",
+    "Pass",
+    "Recording",
+    "RecordingError",
+    "Replay",
     "Scenario",
     "applicable_couplings",
     "contacts",
+    "control_steps",
+    "find_meetings",
+    "measure_coverage",
+    "read_recording",
+    "replay",
+    "replay_problem",
     "robot_path",
     "sample_paths",
     "sampled_contacts",
