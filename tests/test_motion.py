@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from scp_mpc.errors import BoundsError, NotFiniteError
@@ -44,13 +46,13 @@ def test_constant_velocity_in_space():
     assert np.abs(Q - Q_slow).max() < 1e-12
 
 
-@pytest.mark.parametrize("omega", [0.0, 0.8])
-def test_two_intervals_are_one(omega):
+@given(omega=st.floats(-3.0, 3.0), first=st.floats(0.0, 2.0), then=st.floats(0.0, 2.0))
+def test_two_intervals_are_one(omega, first, then):
     """F(a + b) = F(b) F(a), and the noise of both adds up: irregular times need nothing else."""
     motion = Motion(0.2, omega)
-    (F_a, Q_a), (F_b, Q_b), (F, Q) = (motion.transition(t) for t in (0.13, 0.58, 0.71))
-    assert np.allclose(F_b @ F_a, F, atol=1e-14)
-    assert np.allclose(F_b @ Q_a @ F_b.T + Q_b, Q, atol=1e-14)
+    (F_a, Q_a), (F_b, Q_b), (F, Q) = (motion.transition(t) for t in (first, then, first + then))
+    assert np.allclose(F_b @ F_a, F, rtol=0, atol=1e-12)
+    assert np.allclose(F_b @ Q_a @ F_b.T + Q_b, Q, rtol=0, atol=1e-9)
 
 
 def test_no_time_changes_nothing():

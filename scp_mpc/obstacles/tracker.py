@@ -68,6 +68,9 @@ class Tracker:
     With names, identities are known; without, measurements are paired with tracks (see
     `association`), and what is left begins new ones, which are called 0, 1, 2, ...
 
+    A track that is not measured goes on by itself for `settings.keep` seconds. So the controller
+    need not keep vanished obstacles as well: `Settings(freshness=Freshness(keep=0))`.
+
     Args:
         dt: Interval of the predictions [s], the robot's.
         horizon: N, number of their intervals.

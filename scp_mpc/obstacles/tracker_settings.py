@@ -33,7 +33,8 @@ class TrackerSettings:
     them: at 1.2 those for 95 % hold 96 to 97 %, and those for 50 % hold 66 to 76.
 
     Attributes:
-        motions: The ways in which an obstacle may move; at least one.
+        motions: The ways in which an obstacle may move; at least one. For turns at a rate that is
+            not known, several rates: their probabilities are estimated.
         sojourn: Mean time [s] after which the motion is drawn anew, by the motions' weights.
         speed: Standard deviation [m/s] of each component of the velocity of which nothing is
             known yet.
