@@ -1,17 +1,58 @@
-"""Simulation: scenarios, the closed loop, obstacles drawn from predictions, recorded crowds."""
+"""Simulation: scenarios, closed loops, wind, obstacles drawn from predictions, recorded crowds."""
 
-from scp_mpc.simulation.closed_loop import ClosedLoop, simulate
-from scp_mpc.simulation.contact import contacts, robot_path, sampled_contacts
-from scp_mpc.simulation.coverage import LEVELS, Coverage, LeadCoverage, measure_coverage
+from scp_mpc.simulation.closed_loop import (
+    ClosedLoop,
+    Controller,
+    simulate,
+)
+from scp_mpc.simulation.contact import (
+    contacts,
+    robot_path,
+    sampled_contacts,
+)
+from scp_mpc.simulation.coverage import (
+    LEVELS,
+    Coverage,
+    LeadCoverage,
+    measure_coverage,
+)
 from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.crowds import Crowd
-from scp_mpc.simulation.disturbance import CorrelatedDisturbance
-from scp_mpc.simulation.meetings import Meeting, find_meetings
-from scp_mpc.simulation.realisations import COUPLINGS, applicable_couplings, sample_paths
+from scp_mpc.simulation.disturbance import (
+    ConstantPush,
+    CorrelatedDisturbance,
+    Disturbance,
+)
+from scp_mpc.simulation.gust import DrydenGust
+from scp_mpc.simulation.lag import ActuatorLag
+from scp_mpc.simulation.meetings import (
+    Meeting,
+    find_meetings,
+)
+from scp_mpc.simulation.realisations import (
+    COUPLINGS,
+    applicable_couplings,
+    sample_paths,
+)
 from scp_mpc.simulation.recording import Recording
-from scp_mpc.simulation.recordings import RecordingError, read_recording
-from scp_mpc.simulation.replay import TRACKING, Pass, Replay, control_steps, replay, replay_problem
-from scp_mpc.simulation.scenarios import DT, SCENARIOS, STEPS, Scenario
+from scp_mpc.simulation.recordings import (
+    RecordingError,
+    read_recording,
+)
+from scp_mpc.simulation.replay import (
+    TRACKING,
+    Pass,
+    Replay,
+    control_steps,
+    replay,
+    replay_problem,
+)
+from scp_mpc.simulation.scenarios import (
+    DT,
+    SCENARIOS,
+    STEPS,
+    Scenario,
+)
 
 __all__ = [
     "COUPLINGS",
@@ -20,11 +61,16 @@ __all__ = [
     "SCENARIOS",
     "STEPS",
     "TRACKING",
+    "ActuatorLag",
     "ClosedLoop",
+    "ConstantPush",
+    "Controller",
     "CorrelatedDisturbance",
     "Coverage",
     "Crossing",
     "Crowd",
+    "Disturbance",
+    "DrydenGust",
     "LeadCoverage",
     "Meeting",
     "Pass",

@@ -1,11 +1,12 @@
 """The closed loop of III.F: measure, predict, solve, apply, disturb."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 from time import perf_counter
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
@@ -15,6 +16,21 @@ from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.scenarios import DT, STEPS, Scenario
 from scp_mpc.solver.plan import Plan
+
+
+class Controller(Protocol):
+    """What plans at each step: `MPC`, or something around it."""
+
+    @property
+    def settings(self) -> Settings:
+        """How it plans."""
+        ...
+
+    def step(
+        self, y: ArrayLike, x_ref: ArrayLike, obstacles: Sequence[ObstaclePrediction], /
+    ) -> Plan:
+        """Return the plan for this control step."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +108,7 @@ def simulate(
     steps: int = STEPS,
     seed: int = 0,
     advance: Callable[[], object] = lambda: None,
+    controller: Callable[[Problem, Settings | None], Controller] = MPC,
 ) -> ClosedLoop:
     """Run a scenario in closed loop; the same seed gives the same states, bit for bit.
 
@@ -102,12 +119,14 @@ def simulate(
         steps: Number of control steps K.
         seed: Seed of the disturbance.
         advance: Called after each step, for a progress bar.
+        controller: What makes a controller of problem and settings.
     """
     problem = scenario.problem() if problem is None else problem
-    mpc = MPC(problem, settings)
+    mpc = controller(problem, settings)
     rng = scenario.generator(seed)
-    still = repeat(np.zeros(problem.model.nx))
-    wind = still if scenario.disturbance is None else scenario.disturbance.samples(rng)
+    still = np.zeros(problem.model.nx)
+    wind = scenario.disturbance
+    push = (lambda _: still) if wind is None else wind.begin(problem.model, rng)
     states, plans, predictions, seconds = [scenario.start()], [], [], []
     for k in range(steps):
         prediction = scenario.prediction(k)
@@ -115,7 +134,7 @@ def simulate(
         began = perf_counter()
         plan = mpc.step(states[-1], reference, [prediction])
         seconds.append(perf_counter() - began)
-        states.append(problem.model.step(states[-1], plan.u0) + next(wind))
+        states.append(problem.model.step(states[-1], plan.u0) + push(plan.u0))
         plans.append(plan)
         predictions.append(prediction)
         advance()

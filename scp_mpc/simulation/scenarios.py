@@ -13,7 +13,7 @@ from scp_mpc.obstacles.predictors import Predictor, ReportPredictor
 from scp_mpc.problem import Problem
 from scp_mpc.robots.double_integrator import DoubleIntegrator
 from scp_mpc.safety.margin import Promise
-from scp_mpc.simulation.disturbance import CorrelatedDisturbance
+from scp_mpc.simulation.disturbance import CorrelatedDisturbance, Disturbance
 
 DT = 0.2  # [s]
 STEPS = 600  # 120 s
@@ -36,7 +36,7 @@ class Scenario:
     name: str
     title: str
     horizon: int
-    disturbance: CorrelatedDisturbance | None = None
+    disturbance: Disturbance | None = None
     obstacle: CircularObstacle = field(default_factory=CircularObstacle)
     predictor: Predictor = field(default_factory=ReportPredictor)
     reference: CircularReference = field(default_factory=CircularReference)
