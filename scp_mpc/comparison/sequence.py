@@ -1,8 +1,7 @@
 """The control steps of one closed-loop run, so that every solver gets the same problems."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
@@ -10,8 +9,10 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
+from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import Scenario
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.scp import SCP
@@ -55,20 +56,21 @@ def record(
     """
     problem = scenario.problem() if problem is None else problem
     mpc = MPC(problem, settings)
-    x, wind = scenario.start(), _wind(scenario, seed, problem.model.nx)
+    x, push = scenario.start(), _push(scenario, seed, problem.model)
     guess = SCP(problem, settings).solve(x, scenario.states(0)).iterate
     recorded = []
     for k in range(steps):
         x_ref, obstacles = scenario.states(k), tuple(scenario.predictions(k))
         recorded.append(RecordedStep(x, x_ref, obstacles, guess))
         plan = mpc.step(x, x_ref, obstacles)
-        x = problem.model.step(x, plan.u0) + next(wind)
+        x = problem.model.step(x, plan.u0) + push(plan.u0)
         guess = plan.iterate.shifted(problem.model)
         advance()
     return recorded
 
 
-def _wind(scenario: Scenario | Crowd, seed: int, size: int) -> Iterator[FloatArray]:
+def _push(scenario: Scenario | Crowd, seed: int, model: LinearModel) -> Push:
     if isinstance(scenario, Crowd) or scenario.disturbance is None:
-        return repeat(np.zeros(size))
-    return iter(scenario.disturbance.samples(scenario.generator(seed)))
+        still = np.zeros(model.nx)
+        return lambda _: still
+    return scenario.disturbance.begin(model, scenario.generator(seed))
