@@ -1,6 +1,7 @@
 """Robots: the discrete-time dynamics f, one family per file."""
 
 from scp_mpc.robots.bicycle import KinematicBicycle
+from scp_mpc.robots.disturbed import Disturbed
 from scp_mpc.robots.double_integrator import DoubleIntegrator
 from scp_mpc.robots.function import FunctionModel
 from scp_mpc.robots.linear import LinearModel
@@ -21,6 +22,7 @@ from scp_mpc.robots.unicycle import Unicycle
 
 __all__ = [
     "ContinuousModel",
+    "Disturbed",
     "DoubleIntegrator",
     "FunctionModel",
     "KinematicBicycle",
