@@ -1,0 +1,171 @@
+"""Model predictive control that knows what pushes the robot: an estimator before the controller.
+
+measurement -> estimate of state and disturbance -> MPC with both, and the spread of the position
+
+Wind aside, nothing changes: with a disturbance of zero the plan is that of `MPC`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.arrays import FloatArray, as_array, frozen
+from scp_mpc.control.estimator import DisturbanceEstimator, Estimate
+from scp_mpc.control.mpc import MPC
+from scp_mpc.control.regulator import Regulator
+from scp_mpc.control.spread import Foresight, PositionSpread
+from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.problem import Problem
+from scp_mpc.robots.disturbed import Disturbed
+from scp_mpc.settings import Settings
+from scp_mpc.solver.plan import Plan
+
+
+class WindAwareMPC:
+    """`MPC` with an estimator before it; problem, reference and plan stay those of the robot.
+
+        robot = Disturbed(problem.model, alpha=0.85, affects=[1, 3])
+        mpc = WindAwareMPC(problem, DisturbanceEstimator(robot, std=0.08))
+        plan = mpc.step(measured, x_ref, obstacles)
+
+    `plan.X` is (N+1, nx), its row 0 the estimated state, and the estimated disturbance moves the
+    rows after it: it does not obey the nominal dynamics. `plan.iterate` keeps the disturbance.
+
+    Args:
+        problem: What to solve at each step, as without a disturbance.
+        estimator: Of state and disturbance; it belongs to this controller.
+        settings: How to solve it.
+        foresight: What is added to the doubt about the obstacles' positions: nothing, or how far
+            the robot may be from its plan, with the plans to come ("closed loop") or without
+            ("open loop"); see `spread.py`.
+        thrift: If given, the last state is weighed by the cost-to-go of a regulator whose inputs
+            cost so many times R, wind included, instead of by `problem.Qf`; see `regulator.py`.
+            The feedback of a closed loop is then that regulator's.
+
+    Raises:
+        InvalidArgumentError: The estimator's robot is not the problem's, or as in `PositionSpread`.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        estimator: DisturbanceEstimator,
+        settings: Settings | None = None,
+        *,
+        foresight: Foresight = "closed loop",
+        thrift: float | None = None,
+    ) -> None:
+        """Set up the solver for the robot with its disturbance."""
+        if not isinstance(estimator, DisturbanceEstimator):
+            raise InvalidArgumentError("estimator", f"{estimator!r} is not a DisturbanceEstimator")
+        inner = disturbed(problem, estimator.model)
+        if thrift is not None:
+            weight = Regulator(problem, estimator.model, thrift).terminal_weight()
+            inner = replace(inner, Qf=weight)
+        easy = 1.0 if thrift is None else thrift
+        self._spread = PositionSpread(problem, estimator, foresight, easy)
+        self._mpc = MPC(inner, settings)
+        self._problem, self._estimator = problem, estimator
+        self._applied: FloatArray | None = None
+        estimator.reset()
+
+    @property
+    def problem(self) -> Problem:
+        """The problem as it was given, without the disturbance."""
+        return self._problem
+
+    @property
+    def settings(self) -> Settings:
+        """The solver's settings."""
+        return self._mpc.settings
+
+    @property
+    def mpc(self) -> MPC:
+        """The controller behind, whose state has the disturbance; with its counts and overruns."""
+        return self._mpc
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """What the last plan was made with; None before the first step."""
+        return self._estimator.estimate
+
+    def step(
+        self,
+        y: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction] = (),
+        *,
+        applied: ArrayLike | None = None,
+        time: float | None = None,
+        robot_covariance: ArrayLike | None = None,
+    ) -> Plan:
+        """Return the plan for this control step; apply `plan.u0`.
+
+        Args:
+            y: (ny,) measurement now, as the estimator expects it: the state, unless told otherwise.
+            x_ref: (N+1, nx) reference, or (nx,) to be held.
+            obstacles: As in `MPC.step`.
+            applied: (nu,) input that was applied since the last step; the last plan's if None.
+            time: As in `MPC.step`.
+            robot_covariance: (d, d) or (N+1, d, d) [m^2], added to what the estimator knows.
+
+        Raises:
+            InvalidArgumentError: Or one of its subclasses. The controller is then as before.
+            ConcurrentUseError: Another thread is using this controller.
+        """
+        model, problem = self._estimator.model, self._problem
+        N, nx, d = problem.horizon, problem.model.nx, model.dim
+        x_ref = as_array("x_ref", x_ref, (N + 1, nx), (nx,))
+        given = None
+        if robot_covariance is not None:
+            given = as_array("robot_covariance", robot_covariance, (d, d), (N + 1, d, d))
+        before = self._estimator.estimate
+        u = self._applied if applied is None else applied
+        now = self._estimator.update(y, u)
+        try:
+            plan = self._mpc.step(
+                model.joined(now.state, now.disturbance),
+                model.joined(x_ref),
+                obstacles,
+                time=time,
+                robot_covariance=_sum(self._spread.along(now.covariance), given),
+            )
+        except Exception:
+            self._estimator.restore(before)
+            raise
+        self._applied = plan.u0
+        return replace(plan, X=frozen(np.ascontiguousarray(plan.X[:, :nx])))
+
+    def reset(self) -> None:
+        """Forget all steps and all that was estimated."""
+        self._mpc.reset()
+        self._estimator.reset()
+        self._applied = None
+
+
+def disturbed(problem: Problem, model: Disturbed) -> Problem:
+    """The same problem for the robot with its disturbance, which costs nothing.
+
+    Raises:
+        InvalidArgumentError: `model` is of another robot.
+    """
+    plain, other = problem.model, model.nominal
+    same = (
+        np.array_equal(plain.A, other.A)
+        and np.array_equal(plain.B, other.B)
+        and np.array_equal(plain.position, other.position)
+        and plain.dt == other.dt
+    )
+    if not same:
+        raise InvalidArgumentError("model", "not the problem's robot with a disturbance")
+    Q, Qf = (np.pad(weight, (0, model.nw)) for weight in (problem.Q, problem.Qf))
+    return replace(problem, model=model, Q=Q, Qf=Qf)
+
+
+def _sum(first: FloatArray | None, second: FloatArray | None) -> FloatArray | None:
+    if first is None or second is None:
+        return second if first is None else first
+    return first + second
