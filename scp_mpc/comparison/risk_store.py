@@ -27,6 +27,9 @@ class RiskStore:
             for line in path.read_text(encoding="utf-8").splitlines():
                 self._take(line)
 
+    def __contains__(self, key: str) -> bool:
+        return key in self._records
+
     def get(self, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """The record under `key`, measured and written down if there is none."""
         if key not in self._records:
