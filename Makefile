@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test check format bench risk soak clean
+.PHONY: demo test check format bench risk soak wind clean
 
 demo: $(VENV)/.demo  ## run the report's four scenarios; tables and pictures go to out/
 	$(BIN)/scp-mpc report --out $(OUT)
@@ -29,6 +29,9 @@ risk: $(VENV)/.dev  ## promised against measured risk, by Monte Carlo
 
 soak: $(VENV)/.dev  ## a million control steps with faults; stop it and go on as you like
 	$(BIN)/python benchmarks/soak.py --out $(OUT)/soak
+
+wind: $(VENV)/.dev  ## tracking under wind, with and without disturbance rejection
+	$(BIN)/python benchmarks/wind.py --out $(OUT)/wind
 
 clean:
 	rm -rf $(VENV) $(OUT) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
