@@ -1,0 +1,139 @@
+"""Tracking under wind: the report's controller against one that estimates what pushes it.
+
+Every variant meets the same winds. A mean over seeds comes with its 95 % interval, by the
+percentiles of a bootstrap; two variants are compared seed by seed.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.comparison.one_thread import one_thread_each
+from scp_mpc.comparison.progress import progress
+from scp_mpc.comparison.risk_store import RiskStore
+from scp_mpc.comparison.timing_table import measured_on
+from scp_mpc.comparison.wind_figure import wind_figure
+from scp_mpc.comparison.wind_table import markdown
+from scp_mpc.comparison.wind_variants import (
+    ALONE,
+    CALM,
+    EXACT,
+    FORESIGHT,
+    MAIN,
+    OTHERS,
+    Variant,
+    measures,
+)
+from scp_mpc.provenance import provenance
+
+NAME = "wind"  # of the files
+SEEDS = 50
+FEW = 10  # for all but the first group
+STEPS = 600
+WORKERS = 2
+_RESAMPLES = 10_000
+
+Row = dict[str, Any]
+
+
+def main(
+    out: Path,
+    seeds: int = SEEDS,
+    steps: int = STEPS,
+    workers: int = WORKERS,
+    echo: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Measure all variants and write table, numbers and figure.
+
+    Runs that an interrupted measurement left in `out` are kept.
+
+    Args:
+        out: Folder for wind.md, wind.json, wind.png and wind.jsonl.
+        seeds: Winds per variant; for all but the first group at most `FEW`.
+        steps: Control steps per run.
+        workers: Processes.
+        echo: Takes the Markdown table.
+    """
+    few = min(seeds, FEW)
+    plan = {"main": (MAIN, seeds), "calm": (CALM, few), "alone": (ALONE, few)}
+    plan |= {"others": (OTHERS, few), "foresight": (FORESIGHT, few), "exact": (EXACT, few)}
+    store = out / f"{NAME}.jsonl"
+    rows = {
+        group: measured(variants, count, steps, store, workers)
+        for group, (variants, count) in plan.items()
+    }
+    origin = provenance()
+    text = f"{markdown(rows, steps)}\n\n{measured_on(origin)}"
+    echo(text)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{NAME}.md").write_text(text + "\n", encoding="utf-8")
+    numbers = {"seeds": seeds, "steps": steps, "groups": rows, "provenance": origin}
+    (out / f"{NAME}.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
+    wind_figure(rows["main"], rows["others"]).savefig(out / f"{NAME}.png", dpi=150)
+
+
+def measured(
+    variants: Sequence[Variant],
+    seeds: int,
+    steps: int,
+    store: Path | None = None,
+    workers: int = 1,
+) -> list[Row]:
+    """One row per variant; it is compared with the first one under the same disturbance.
+
+    Args:
+        variants: What to run.
+        seeds: Winds per variant; one if nothing about it is drawn.
+        steps: Control steps per run.
+        store: File of finished runs.
+        workers: Processes.
+    """
+    kept = RiskStore(store, steps=steps)
+    counts = {variant: seeds if variant.random else 1 for variant in variants}
+    keys = [(v, seed) for seed in range(seeds) for v in variants if seed < counts[v]]
+    names = [f"{variant.name}, seed {seed}" for variant, seed in keys]
+    missing = [pair for pair in zip(names, keys, strict=True) if pair[0] not in kept]
+    if missing:
+        with one_thread_each(workers) as pool, progress(len(missing)) as advance:
+            futures = {name: pool.submit(measures, *key, steps) for name, key in missing}
+            for name, future in futures.items():
+                kept.get(name, future.result)
+                advance()
+    runs = {
+        variant: [kept.get(f"{variant.name}, seed {seed}", dict) for seed in range(counts[variant])]
+        for variant in variants
+    }
+    first = {variant.disturbance: runs[variant] for variant in reversed(variants)}
+    return [summary(v, runs[v], first[v.disturbance]) for v in variants]
+
+
+def summary(variant: Variant, runs: Sequence[Row], base: Sequence[Row]) -> Row:
+    """Means over the seeds with their intervals, and the difference to others in the same winds."""
+    rms, other = (np.array([run["rms"] for run in which]) for which in (runs, base))
+    middle = np.array([run["median"] for run in runs])
+    row: Row = asdict(variant) | {"name": variant.name, "controller": variant.controller}
+    row |= {
+        "runs": len(runs),
+        "rms": rms.tolist(),
+        "medians": middle.tolist(),
+        "rms_median": float(np.median(rms)),
+    }
+    row["rms_mean"], row["rms_interval"] = float(rms.mean()), interval(rms)
+    row["usual"], row["usual_interval"] = float(middle.mean()), interval(middle)
+    row["excess"], row["excess_interval"] = float((rms - other).mean()), interval(rms - other)
+    row["clearance"] = min(run["clearance"] for run in runs)
+    row["distance"] = min(run["distance"] for run in runs)
+    row |= {key: sum(run[key] for run in runs) for key in ("contact", "slack", "not_ok")}
+    return row
+
+
+def interval(values: FloatArray) -> list[float]:
+    """Ends of the 95 % interval of a mean, by the bootstrap's percentiles."""
+    drawn = np.random.default_rng(0).integers(len(values), size=(_RESAMPLES, len(values)))
+    low, high = np.percentile(values[drawn].mean(axis=1), [2.5, 97.5])
+    return [float(low), float(high)]

@@ -1,0 +1,60 @@
+"""A small run of the real comparison under wind."""
+
+import numpy as np
+import pytest
+
+from scp_mpc.comparison import wind
+from scp_mpc.comparison.wind_figure import wind_figure
+from scp_mpc.comparison.wind_table import markdown
+from scp_mpc.comparison.wind_variants import ALONE, CALM, FORESIGHT, MAIN, OTHERS, Variant
+
+
+def test_variants_are_all_different_and_named_so():
+    variants = [*MAIN, *CALM, *ALONE, *FORESIGHT, *OTHERS]
+    assert len({variant.name for variant in variants}) == len(variants)
+    assert (MAIN[0].horizon, MAIN[0].rejects, MAIN[0].thrift) == (30, False, None)
+    assert all(row.disturbance == "report's wind" for row in MAIN)
+
+
+def test_all_variants_meet_the_same_wind():
+    runs = [variant.run(seed=3, steps=5) for variant in (MAIN[1], MAIN[4])]
+    pushed = [
+        run.states[1:]
+        - [run.problem.model.step(x, u) for x, u in zip(run.states, run.inputs, strict=False)]
+        for run in runs
+    ]
+    np.testing.assert_allclose(*pushed, atol=1e-12)
+    assert np.abs(pushed[0]).max() > 0.02
+    assert np.abs(runs[0].inputs - runs[1].inputs).max() > 0.02
+
+
+def test_measured_rows_are_kept_and_shown(tmp_path):
+    variants = (Variant(8, False, obstacle=False), Variant(8, True, obstacle=False))
+    store = tmp_path / "wind.jsonl"
+    rows = wind.measured(variants, seeds=3, steps=40, store=store)
+    assert rows[1]["usual"] < rows[0]["usual"]
+    assert rows[0]["excess"] == 0
+    assert rows[1]["excess"] == pytest.approx(rows[1]["rms_mean"] - rows[0]["rms_mean"])
+    assert rows[1]["rms_interval"][0] <= rows[1]["rms_mean"] <= rows[1]["rms_interval"][1]
+    assert (rows[0]["runs"], rows[0]["contact"], len(rows[0]["rms"])) == (3, 0, 3)
+    run = variants[1].run(1, 40)
+    expected = np.sqrt(np.mean(run.tracking_errors[1:] ** 2))
+    assert rows[1]["rms"][1] == pytest.approx(expected)
+    before = store.read_text()
+    assert wind.measured(variants, seeds=3, steps=40, store=store) == rows
+    assert store.read_text() == before
+    text = markdown({"main": rows, "others": []}, 40)
+    assert text.count("\n| 8 |") == 2
+    assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
+    figure = wind_figure(rows, rows)
+    assert len(figure.axes) == 3
+    assert len(wind_figure(rows).axes) == 2
+
+
+def test_interval_of_a_mean_covers_it():
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(100):
+        low, high = wind.interval(rng.standard_normal(40))
+        inside += low <= 0 <= high
+    assert 86 <= inside <= 100
