@@ -19,22 +19,17 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.robots.linear import LinearModel, as_linear
 from scp_mpc.solver.iterate import Iterate
 
 
 def linear_model(problem: Problem) -> LinearModel:
-    """The problem's model.
+    """The problem's model, which peers need to be linear.
 
     Raises:
-        InvalidArgumentError: It is not linear.
+        InvalidArgumentError: It is not.
     """
-    model = problem.model
-    if not isinstance(model, LinearModel):
-        raise InvalidArgumentError(
-            "problem.model", f"{type(model).__name__}, but peers know linear models only"
-        )
-    return model
+    return as_linear("problem.model", problem.model)
 
 
 class Unknowns:

@@ -9,7 +9,7 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.robots.linear import LinearModel, as_linear
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import Push
@@ -56,7 +56,7 @@ def record(
     """
     problem = scenario.problem() if problem is None else problem
     mpc = MPC(problem, settings)
-    x, push = scenario.start(), _push(scenario, seed, problem.model)
+    x, push = scenario.start(), _push(scenario, seed, as_linear("problem.model", problem.model))
     guess = SCP(problem, settings).solve(x, scenario.states(0)).iterate
     recorded = []
     for k in range(steps):

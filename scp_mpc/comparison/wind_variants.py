@@ -22,6 +22,7 @@ from scp_mpc.control.spread import Foresight
 from scp_mpc.control.wind_aware import WindAwareMPC
 from scp_mpc.problem import Problem
 from scp_mpc.robots.disturbed import Disturbed
+from scp_mpc.robots.linear import as_linear
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.closed_loop import ClosedLoop, Controller, simulate
 from scp_mpc.simulation.disturbance import ConstantPush, CorrelatedDisturbance, Disturbance
@@ -98,7 +99,8 @@ class Variant:
 
     def _controller(self, problem: Problem, settings: Settings | None) -> Controller:
         fades = self.disturbance in ("report's wind", "none")
-        robot = Disturbed(problem.model, 0.85, [1, 3]) if fades else Disturbed(problem.model, 0.98)
+        model = as_linear("problem.model", problem.model)
+        robot = Disturbed(model, 0.85, [1, 3]) if fades else Disturbed(model, 0.98)
         if self.rejects:
             estimator = DisturbanceEstimator(robot, std=0.08 if fades else 0.1)
             return WindAwareMPC(

@@ -20,6 +20,7 @@ from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.disturbed import Disturbed
+from scp_mpc.robots.linear import as_linear
 from scp_mpc.settings import Settings
 from scp_mpc.solver.plan import Plan
 
@@ -152,7 +153,7 @@ def disturbed(problem: Problem, model: Disturbed) -> Problem:
     Raises:
         InvalidArgumentError: `model` is of another robot.
     """
-    plain, other = problem.model, model.nominal
+    plain, other = as_linear("problem.model", problem.model), model.nominal
     same = (
         np.array_equal(plain.A, other.A)
         and np.array_equal(plain.B, other.B)
@@ -162,7 +163,9 @@ def disturbed(problem: Problem, model: Disturbed) -> Problem:
     if not same:
         raise InvalidArgumentError("model", "not the problem's robot with a disturbance")
     Q, Qf = (np.pad(weight, (0, model.nw)) for weight in (problem.Q, problem.Qf))
-    return replace(problem, model=model, Q=Q, Qf=Qf)
+    free = np.full(model.nw, np.inf)
+    x_min, x_max = np.append(problem.x_min, -free), np.append(problem.x_max, free)
+    return replace(problem, model=model, Q=Q, Qf=Qf, x_min=x_min, x_max=x_max)
 
 
 def _sum(first: FloatArray | None, second: FloatArray | None) -> FloatArray | None:

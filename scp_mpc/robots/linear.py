@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import fractional_matrix_power
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
-from scp_mpc.errors import ShapeError
+from scp_mpc.errors import InvalidArgumentError, ShapeError
 from scp_mpc.robots.model import Linearisation, Model, as_period, as_places
 
 _MOST_POWERS = 64
@@ -175,3 +175,14 @@ class LinearModel(Model):
             part = (1 - fraction) * np.eye(size) + fraction * whole
         power: FloatArray = part.real
         return power
+
+
+def as_linear(argument: str, model: Model) -> LinearModel:
+    """Return a model that has to be linear.
+
+    Raises:
+        InvalidArgumentError: It is not.
+    """
+    if not isinstance(model, LinearModel):
+        raise InvalidArgumentError(argument, f"{type(model).__name__} is not linear")
+    return model

@@ -12,8 +12,10 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import as_linear
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.settings import Settings
+from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import DT, STEPS, Scenario
 from scp_mpc.solver.plan import Plan
 
@@ -126,7 +128,9 @@ def simulate(
     rng = scenario.generator(seed)
     still = np.zeros(problem.model.nx)
     wind = scenario.disturbance
-    push = (lambda _: still) if wind is None else wind.begin(problem.model, rng)
+    push: Push = lambda _: still  # noqa: E731
+    if wind is not None:
+        push = wind.begin(as_linear("problem.model", problem.model), rng)
     states, plans, predictions, seconds = [scenario.start()], [], [], []
     for k in range(steps):
         prediction = scenario.prediction(k)
