@@ -12,7 +12,7 @@ GATE = 9.21
 
 
 def brute_force(tracks, measured, noise):
-    """The best of all partial matchings within the gate: least sum of d2 + log det S - most."""
+    """The best of all partial matchings within the gate: least sum of d2 + log det S - its most."""
     m, P = tracks
     count, found = len(measured), {}
     for i in range(len(m)):
@@ -20,7 +20,8 @@ def brute_force(tracks, measured, noise):
             S = P[i, :2, :2] + noise[k]
             e = measured[k] - m[i, :2]
             found[i, k] = e @ np.linalg.inv(S) @ e, np.log(np.linalg.det(S))
-    ceiling = GATE + max(logdet for _, logdet in found.values())
+    near = [logdet for square, logdet in found.values() if square <= GATE]
+    ceiling = GATE + max(near, default=0.0)
     best, pairs = np.inf, []
     slots = [*range(count), *([None] * len(m))]
     for choice in set(permutations(slots, len(m))):

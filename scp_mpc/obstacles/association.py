@@ -8,7 +8,7 @@ Notation:
 A pair is possible where d2 is below the chi-square quantile of the gate. Among all ways to pair
 them off, each track and measurement at most once, the nearest is taken: the one with the most
 likelihood, the sum of d2 + log det S being least, where leaving a pair out costs as much as one at
-the gate with the widest S (global nearest neighbour: Blackman and Popoli, 1999).
+the gate with the widest S of these pairs (global nearest neighbour: Blackman and Popoli, 1999).
 """
 
 import numpy as np
@@ -31,12 +31,17 @@ def associate(
     """
     m, P = tracks
     d = measured.shape[1]
-    S = P[:, None, :d, :d] + noise
-    if not S.size:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    square, logdet = mahalanobis(measured - m[:, None, :d], S)
+    e = measured - m[:, None, :d]
+    widest = np.trace(P[:, None, :d, :d] + noise, axis1=-2, axis2=-1)
+    i, k = np.nonzero(np.square(e).sum(axis=-1) <= gate * widest)  # d2 >= |e|^2 / trace S
+    square, logdet = mahalanobis(e[i, k], P[i, :d, :d] + noise[k])
     possible = square <= gate
-    excess = square + logdet - (gate + logdet.max())
-    pairs = linear_sum_assignment(np.where(possible, excess, 0.0))
-    kept = possible[pairs]
-    return pairs[0][kept], pairs[1][kept]
+    if not possible.any():
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    i, k, cost = i[possible], k[possible], (square + logdet)[possible]
+    excess = np.zeros(e.shape[:2])
+    excess[i, k] = cost - gate - logdet[possible].max()
+    near = np.zeros(e.shape[:2], np.bool_)
+    near[i, k] = True
+    old, new = linear_sum_assignment(excess)
+    return old[near[old, new]], new[near[old, new]]
