@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import linear_model
+from scp_mpc.comparison.nlp import linear_model, require_round
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.margin import JointRisk, StageRisk
@@ -98,6 +98,7 @@ def _depth(
     """Largest violation at the samples [m] beyond what rounding explains; 0 for none."""
     if not obstacles:
         return 0.0
+    require_round(obstacles)
     means = np.array([o.means[1:] for o in obstacles])
     Sigma = np.array([o.covariances[1:] for o in obstacles])
     shape = means.shape[:2]
