@@ -100,6 +100,10 @@ def test_others_are_as_without_polytopes_beside_them(inflation, seed, dim):
     np.testing.assert_array_equal(bend[1], inflation.bend(alone, s[1:2], expected)[0])
     assert not bend[[0, 2], :, -1].any()
     np.testing.assert_array_equal(bend[[0, 2], :, :dim], spaces.bend[[0, 2]])
+    y = p - sets.means
+    for j in (0, 2):
+        near = sets.shapes.taken(np.array([j])).nearest(y[[j]])
+        np.testing.assert_array_equal(spaces.bend[j], near.bend[0])
     room = inflation.clearance(sets, p)
     np.testing.assert_array_equal(room[1], inflation.clearance(alone, p)[0])
     expected = inflation.linearise(sets, p, np.full(4, S_REF), start).value
