@@ -154,6 +154,8 @@ class ActiveSetSolver:
         """Let DAQP find v (nv,) and all forces (nf + K,), with the bounds that matter."""
         F, nf, K = program.F, len(program.F), len(program.b)
         lower, upper, cap = program.lower, program.upper, program.cap
+        if not K and (lower <= 0).all() and (upper >= 0).all():
+            return self._zero, np.zeros(nf)
         soft = None if cap is None else np.where(np.isfinite(cap), _SOFT, 0).astype(np.intc)
         within = (active[:nf] != 0) | (lower > 0) | (upper < 0) | (nf <= _SMALL)
         sense = np.where(active < 0, _LOWER, active).astype(np.intc)

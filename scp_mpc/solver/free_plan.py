@@ -14,6 +14,8 @@ from scp_mpc.solver.condensed_step import CondensedStep
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.trust_region import TrustRegion
 
+_ROUGH = 1  # iterations where an obstacle is in the way, and only its sides are sought from here
+
 
 @dataclass(frozen=True, eq=False)
 class FreePlan:
@@ -87,13 +89,14 @@ def free_nonlinear(
     """
     problem, N = at.problem, at.problem.horizon
     active = np.zeros(at.layout.size - at.layout.boxed.start, dtype=np.intp)
-    inputs = np.tile(problem.model.idle, (N, 1))
+    inputs, limit = np.tile(problem.model.idle, (N, 1)), settings.max_iterations
     if known is not None and known.inputs is not None:
         inputs, active = known.inputs, -np.sign(known.reaction).astype(np.intp)
     elif last is not None:
         inputs = last.inputs if last.free is None else last.free
+        limit = min(limit, _ROUGH) if last.touches else limit
     sizes = np.full(problem.max_obstacles, problem.size.reference)
     start = at.start(inputs, sizes, None)
-    end = TrustRegion(at, None, settings).descend_from(start, active, settings.max_iterations)
+    end = TrustRegion(at, None, settings).descend_from(start, active, limit)
     point = start if end is None else end.point
     return FreePlan(point.y, point.reaction, lambda: point, point.rolled.inputs)

@@ -149,8 +149,8 @@ class VaryingMotion(Motion):
         """
         N, _, nu = self.B.shape
         e: FloatArray = self.B @ inputs.reshape(N, nu, -1)
-        for i in range(1, N):
-            e[i] += self.A[i] @ e[i - 1]
+        for A, before, after in zip(self.A[1:], e[:-1], e[1:], strict=True):
+            after += A.dot(before)
         return e
 
     def positions(self, e: FloatArray, inputs: FloatArray) -> FloatArray:

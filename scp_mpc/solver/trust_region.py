@@ -25,7 +25,7 @@ from scp_mpc.solver.conflicts import Conflicts, Tangent
 from scp_mpc.solver.curvature import bent_program, newton_step
 from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.iterate import NEGLIGIBLE
-from scp_mpc.solver.search import ROUNDING, SURPLUS, End, Search
+from scp_mpc.solver.search import ROUNDING, End, Search
 from scp_mpc.solver.varying import Varying, VaryingChart
 
 _ENOUGH = 0.01  # share of the predicted decrease that a trial must bring
@@ -110,11 +110,11 @@ class TrustRegion(Search):
                     break
                 continue
             better = trial.residuals.worst
-            point, tangent, before, residual = trial, None, residual, better
+            point, tangent, residual = trial, None, better
             end = End(trial, held.active, self._cap, iteration)
             active = held.active
             watch.learn(task, began)
-            if better <= SURPLUS * self._tolerance or max(better, before) <= self._tolerance:
+            if better <= self._tolerance:
                 break
             if self._goal is not None and self._vain(iteration, trial, self._goal):
                 return None
