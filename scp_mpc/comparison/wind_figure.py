@@ -13,7 +13,7 @@ Row = dict[str, Any]
 
 # Okabe and Ito's colours; filled (rejection) against hollow (nominal) helps in print.
 _COLOURS = {30: "#0072B2", 8: "#D55E00"}
-_TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
+_TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 
 def wind_figure(main: Sequence[Row], others: Sequence[Row] = ()) -> Figure:
@@ -25,7 +25,7 @@ def wind_figure(main: Sequence[Row], others: Sequence[Row] = ()) -> Figure:
     """
     rows = max(len(main), len(others))
     count = 3 if others else 2
-    figure = Figure(figsize=(4.0 + 5.0 * count, 2.2 + 0.45 * rows), layout="constrained")
+    figure = Figure(figsize=(4.0 + 5.2 * count, 2.2 + 0.45 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, count)
     title = f"{main[0]['disturbance']}, {main[0]['runs']} runs each"
