@@ -212,8 +212,11 @@ class ActiveSetSolver:
             model.settings = {"primal_tol": _ACCURACY, "time_limit": seconds}
             weight = np.where(np.isfinite(cap), cap, 0.0)
             softness = np.full(len(rows), _YIELDING)
-            model.soft_weights(softness, softness, weight, weight)
-            v, _, flag, info = model.solve()
+            try:
+                model.soft_weights(softness, softness, weight, weight)
+                v, _, flag, info = model.solve()
+            except RuntimeError:  # rows that are no numbers, or next to none
+                return None
         else:
             v, _, flag, info = daqp.solve(
                 identity, zero, rows, most, least, sense, primal_tol=_ACCURACY, time_limit=seconds

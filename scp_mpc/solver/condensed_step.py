@@ -60,6 +60,11 @@ class CondensedStep:
         condensed.begin(step)
         self.bounds = self.layout.bounds(step)
 
+    @property
+    def charted(self) -> bool:
+        """Whether there is a chart."""
+        return hasattr(self, "chart")
+
     def path(self, y: FloatArray) -> FloatArray:
         """(C+1, d) positions of the robot in y, from now on [m]."""
         return self.data.path(y[self.layout.p])

@@ -14,7 +14,7 @@ from scp_mpc.solver.condensed_step import CondensedStep
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.trust_region import TrustRegion
 
-_ROUGH = 1  # iterations where an obstacle is in the way, and only its sides are sought from here
+_ROUGH = 3  # iterations where an obstacle is in the way, and only its sides are sought from here
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +89,22 @@ def free_nonlinear(
     """
     problem, N = at.problem, at.problem.horizon
     active = np.zeros(at.layout.size - at.layout.boxed.start, dtype=np.intp)
-    inputs, limit = np.tile(problem.model.idle, (N, 1)), settings.max_iterations
-    if known is not None and known.inputs is not None:
-        inputs, active = known.inputs, -np.sign(known.reaction).astype(np.intp)
-    elif last is not None:
-        inputs = last.inputs if last.free is None else last.free
-        limit = min(limit, _ROUGH) if last.touches else limit
     sizes = np.full(problem.max_obstacles, problem.size.reference)
-    start = at.start(inputs, sizes, None)
+    limit = settings.max_iterations
+    if known is not None and known.inputs is not None:
+        start = at.start(known.inputs, sizes, None)
+        active = -np.sign(known.reaction).astype(np.intp)
+    elif last is not None:
+        # Both end in local optima only, so the better one counts; then none that is known is lost.
+        starts = [at.start(last.inputs, sizes, None, last.states[1:] - at.data.x_ref[1:])]
+        if last.free is not None:
+            starts.append(at.start(last.free, sizes, None))
+        start = min(starts, key=lambda point: at.merit(point.cost, 0.0, point.excess))
+        limit = min(limit, _ROUGH) if last.touches else limit
+    else:
+        start = at.start(np.tile(problem.model.idle, (N, 1)), sizes, None)
     end = TrustRegion(at, None, settings).descend_from(start, active, limit)
+    if not at.charted:
+        raise np.linalg.LinAlgError("no plan to begin from has finite derivatives")
     point = start if end is None else end.point
     return FreePlan(point.y, point.reaction, lambda: point, point.rolled.inputs)

@@ -81,54 +81,68 @@ class TrustRegion(Search):
         """Descend from a plan; the first half-spaces are a tangent's, if one is given."""
         watch, first = self._step.watch, self._step.condensed.sampling.first
         point, end, residual = start, None, np.inf
-        self._chart(start)
+        if not self._charted(start):
+            return None
         for iteration in range(1, limit + 1):
             task = first if iteration == 1 else "program"
             if iteration > 1:
                 if not watch.affords(task):
                     break
                 began = watch.elapsed
-            self._about = point
-            solved = self._convex(tangent or self._tangent(point), active)
-            if solved is None:
-                watch.learn(task, began)
+            attempt = self._attempt(point, tangent or self._tangent(point), active, residual)
+            watch.learn(task, began)
+            if attempt is None:
                 break
-            program, held = solved
-            W = self._curvature(tangent or self._tangent(point), held)
-            held = self._bent(program, held, W)
-            trial = self._step.point(self._conflicts, held)
-            accepted = self._accepted(point, trial, program, held, W, residual)
-            if not accepted and trial.pushed is not None and np.isfinite(trial.cost):
-                other = self._corrected(program, held, trial.pushed.tangent)
-                if other is not None:
-                    trial = self._step.point(self._conflicts, other)
-                    accepted = self._accepted(point, trial, program, held, W, residual)
-            if not accepted:
+            accepted, trial, held = attempt
+            done = trial.residuals.worst <= self._tolerance
+            if not (accepted and (done or self._charted(trial))):
                 self._shrink(point, held)
-                watch.learn(task, began)
                 if self._radius < _SMALLEST:
                     break
                 continue
-            better = trial.residuals.worst
-            point, tangent, residual = trial, None, better
-            end = End(trial, held.active, self._cap, iteration)
-            active = held.active
-            watch.learn(task, began)
-            if better <= self._tolerance:
+            point, tangent, residual, active = trial, None, trial.residuals.worst, held.active
+            end = End(trial, active, self._cap, iteration)
+            if done:
                 break
             if self._goal is not None and self._vain(iteration, trial, self._goal):
                 return None
-            self._chart(point)
         return end
+
+    def _attempt(
+        self, point: Point, tangent: Tangent | None, active: IntArray, residual: float
+    ) -> tuple[bool, Point, Held] | None:
+        """Whether a trial is accepted, the trial and its program's solution; None if unsolved."""
+        self._about = point
+        solved = self._convex(tangent, active)
+        if solved is None:
+            return None
+        program, held = solved
+        W = self._curvature(tangent, held)
+        held = self._bent(program, held, W)
+        trial = self._step.point(self._conflicts, held)
+        if self._accepted(point, trial, program, held, W, residual):
+            return True, trial, held
+        if trial.pushed is None or not np.isfinite(trial.cost):
+            return False, trial, held
+        other = self._corrected(program, held, trial.pushed.tangent)
+        if other is None:
+            return False, trial, held
+        trial = self._step.point(self._conflicts, other)
+        return self._accepted(point, trial, program, held, W, residual), trial, held
 
     def _tangent(self, point: Point) -> Tangent | None:
         return None if point.pushed is None else point.pushed.tangent
 
-    def _chart(self, point: Point) -> None:
+    def _charted(self, point: Point) -> bool:
+        """Chart the problem about a plan, if its derivatives are such that it can be done."""
         with self._step.watch.linearising:
             condensed = self._step.condensed
             assert isinstance(condensed, Varying)
-            self._step.chart = condensed.chart(point.rolled, point.y[self._step.layout.s])
+            try:
+                self._step.chart = condensed.chart(point.rolled, point.y[self._step.layout.s])
+            except np.linalg.LinAlgError:
+                return False
+        return True
 
     def _convex(
         self, tangent: Tangent | None, active: IntArray

@@ -25,6 +25,7 @@ from scp_mpc.solver.sampling import NonlinearSampling
 from scp_mpc.solver.step_data import StepData
 
 _CLOSED = 1e-12  # defect that is none, relative to the largest state
+_RIDGES = (1e-14, 1e-12, 1e-10)  # of the Hessian, relative to its largest diagonal entry
 _ROUNDS = 4  # of Newton's method, before stages are walked through one by one
 
 
@@ -122,9 +123,7 @@ class Varying(Condensation):
         QG = 2 * problem.Q @ G
         QG[-1] = 2 * problem.Qf @ G[-1]
         flat, weighed = G.reshape(-1, inputs), QG.reshape(-1, inputs)
-        L, info = dpotrf(flat.T @ weighed + self._effort, lower=1, clean=1)
-        if info != 0:
-            raise np.linalg.LinAlgError("the Hessian is not positive definite")
+        L = _factor(flat.T @ weighed + self._effort)
         inverse, _ = dtrtri(L, lower=1)
         back = np.ascontiguousarray(inverse.T)
         bounded = G[:, problem.bounded_states].reshape(-1, inputs) @ back
@@ -162,3 +161,15 @@ class Varying(Condensation):
             before = worst
             states[1:] += motion.roll(defect)
         return None
+
+
+def _factor(H: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a Hessian; with a ridge where rounding ate what is definite."""
+    scale = float(H.diagonal().max())
+    for ridge in (0.0, *_RIDGES):
+        if ridge:
+            H.flat[:: len(H) + 1] += ridge * scale
+        L, info = dpotrf(H, lower=1, clean=1)
+        if info == 0:
+            return L
+    raise np.linalg.LinAlgError("the Hessian is not positive definite")
