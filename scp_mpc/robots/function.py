@@ -150,11 +150,17 @@ class FunctionModel(ContinuousModel):
         after = x + share * (self.derivative(x, u) - x)
         return Linearisation(after, both[..., : self.nx], both[..., self.nx :])
 
-    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over one interval."""
+    def curvature(
+        self,
+        states: FloatArray,
+        inputs: FloatArray,
+        costates: FloatArray,
+        fraction: ArrayLike = 1.0,
+    ) -> FloatArray:
+        """Return sum_k y_k (Hessian of f_k in z), (..., n, n)."""
         if self.discrete:
-            return Model.curvature(self, states, inputs, costates)
-        return super().curvature(states, inputs, costates)
+            return Model.curvature(self, states, inputs, costates, fraction)
+        return super().curvature(states, inputs, costates, fraction)
 
     def brake(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,) by which the position comes to rest."""

@@ -94,7 +94,13 @@ class LinearModel(Model):
             np.broadcast_to(B, (*lead, *B.shape[-2:])),
         )
 
-    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
+    def curvature(
+        self,
+        states: FloatArray,
+        inputs: FloatArray,
+        costates: FloatArray,
+        fraction: ArrayLike = 1.0,  # noqa: ARG002
+    ) -> FloatArray:
         """Return zeros (..., nx+nu, nx+nu)."""
         lead = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1], costates.shape[:-1])
         n = self.nx + self.nu

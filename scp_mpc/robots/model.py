@@ -95,8 +95,14 @@ class Model(ABC):
         """Return the next state f(x, u) (nx,)."""
         return self.advance(x, u)
 
-    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over one interval.
+    def curvature(
+        self,
+        states: FloatArray,
+        inputs: FloatArray,
+        costates: FloatArray,
+        fraction: ArrayLike = 1.0,
+    ) -> FloatArray:
+        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over that share of an interval.
 
         Here from central differences of `linearise`, at all points in one call.
 
@@ -104,10 +110,11 @@ class Model(ABC):
             states: (..., nx).
             inputs: (..., nu).
             costates: y (..., nx).
+            fraction: Of the interval; broadcasts over the leading axes.
         """
 
         def gradients(z: FloatArray) -> FloatArray:
-            there = self.linearise(z[..., : self.nx], z[..., self.nx :])
+            there = self.linearise(z[..., : self.nx], z[..., self.nx :], fraction)
             both = np.concatenate([there.A, there.B], axis=-1)
             return (costates[..., None, :] @ both)[..., 0, :]
 

@@ -74,9 +74,15 @@ class ContinuousModel(NonlinearModel):
         both = self._chain(slopes, h[..., None])[1]
         return Linearisation(after, both[..., : self.nx], both[..., self.nx :])
 
-    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over one interval, exactly."""
-        x, u, h = self._spread(states, inputs, 1.0)
+    def curvature(
+        self,
+        states: FloatArray,
+        inputs: FloatArray,
+        costates: FloatArray,
+        fraction: ArrayLike = 1.0,
+    ) -> FloatArray:
+        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), exactly."""
+        x, u, h = self._spread(states, inputs, fraction)
         points, _ = self._march(x, u, h)
         inputs = np.broadcast_to(u, (len(points), *u.shape))
         slopes = self.jacobians(points, inputs)

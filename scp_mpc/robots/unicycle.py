@@ -82,9 +82,15 @@ class Unicycle(NonlinearModel):
         both[..., 2, 5] = both[..., 3, 4] = arc.h
         return Linearisation(after, both[..., :4], both[..., 4:])
 
-    def curvature(self, states: FloatArray, inputs: FloatArray, costates: FloatArray) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in (x, u)), (..., 6, 6), over one interval."""
-        arc = _Arc(states, inputs, self.dt)
+    def curvature(
+        self,
+        states: FloatArray,
+        inputs: FloatArray,
+        costates: FloatArray,
+        fraction: ArrayLike = 1.0,
+    ) -> FloatArray:
+        """Return sum_k y_k (Hessian of f_k in (x, u)), (..., 6, 6), after that share of dt."""
+        arc = _Arc(states, inputs, self._time(fraction))
         dual = costates[..., 0] - 1j * costates[..., 1]
         bent = np.zeros((*np.broadcast_shapes(arc.way.shape, dual.shape), 6, 6))
         for (row, column), entry in arc.bends().items():

@@ -43,6 +43,11 @@ class Pushed:
     slack: FloatArray
     conflicts: Conflicts
 
+    def on(self, size: int) -> FloatArray:
+        """Phi (ny,), on positions and sizes."""
+        weights = (self.force[:, None] * self.tangent.a).ravel()
+        return np.bincount(self.conflicts.at.ravel(), weights, size).astype(np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -101,9 +106,7 @@ class Certificate:
         pull[-1] = -2 * (e[-1] @ problem.Qf)
         on_u, on_s = np.zeros(c.shape), np.zeros(problem.max_obstacles)
         if pushed is not None:
-            weights = (pushed.force[:, None] * pushed.tangent.a).ravel()
-            at = pushed.conflicts.at.ravel()
-            phi = np.bincount(at, weights=weights, minlength=c.size).astype(np.float64)
+            phi = pushed.on(c.size)
             on_e, between = rolled.motion.pull(phi[c.p])
             pull += on_e
             on_s = phi[c.s]

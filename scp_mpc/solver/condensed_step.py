@@ -59,11 +59,7 @@ class CondensedStep:
         self._qp, self._certificate = qp, Certificate(problem, condensed.layout)
         condensed.begin(step)
         self.bounds = self.layout.bounds(step)
-
-    @property
-    def charted(self) -> bool:
-        """Whether there is a chart."""
-        return hasattr(self, "chart")
+        self._begun: tuple[FloatArray, FloatArray, tuple[FloatArray, Rolled]] | None = None
 
     def path(self, y: FloatArray) -> FloatArray:
         """(C+1, d) positions of the robot in y, from now on [m]."""
@@ -116,8 +112,10 @@ class CondensedStep:
         inputs = problem.limited(inputs, self.data.u_last)
         s = np.minimum(np.maximum(s, size.lower), size.upper)
         rolled = self.condensed.rolled(inputs, guess)
-        y = self.layout.outputs(self.data, rolled.positions, s, inputs, rolled.deviations)
-        return y, rolled
+        return self._outputs(rolled, s), rolled
+
+    def _outputs(self, rolled: Rolled, s: FloatArray) -> FloatArray:
+        return self.layout.outputs(self.data, rolled.positions, s, rolled.inputs, rolled.deviations)
 
     def start(
         self,
@@ -127,7 +125,12 @@ class CondensedStep:
         guess: FloatArray | None = None,
     ) -> Point:
         """The plan of inputs (N, nu) and sizes (M,), on which nothing pushes."""
-        y, rolled = self.rolled(inputs, s, guess)
+        known = self._begun
+        if known is not None and np.array_equal(known[0], inputs) and np.array_equal(known[1], s):
+            y, rolled = known[2]
+        else:
+            y, rolled = self.rolled(inputs, s, guess)
+        self._begun = inputs, s, (y, rolled)
         pushed = None
         if conflicts is not None:
             nothing = np.zeros(len(conflicts.point))
@@ -155,9 +158,13 @@ class CondensedStep:
 
     def costates(
         self, rolled: Rolled, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
-    ) -> FloatArray:
-        """See `Certificate.costates`."""
-        return self._certificate.costates(rolled, e, reaction, pushed)[0]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Multipliers nu (N, nx) and forces (C d,) on positions; see `Certificate.costates`."""
+        nu = self._certificate.costates(rolled, e, reaction, pushed)[0]
+        phi = np.zeros(self.layout.p.stop)
+        if pushed is not None:
+            phi = pushed.on(self.layout.size)[self.layout.p]
+        return nu, phi
 
     def merit(self, cost: float, slack: float, excess: FloatArray) -> float:
         """Cost and the penalties on all slack [m] and on the states' excess."""

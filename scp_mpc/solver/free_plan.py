@@ -1,7 +1,7 @@
 """The plan that ignores the obstacles: no other costs less."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,8 +13,6 @@ from scp_mpc.solver.condensed import Condensed
 from scp_mpc.solver.condensed_step import CondensedStep
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.trust_region import TrustRegion
-
-_ROUGH = 3  # iterations where an obstacle is in the way, and only its sides are sought from here
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,30 +79,56 @@ def free_nonlinear(
 ) -> FreePlan:
     """Descend to the free plan of a nonlinear robot.
 
+    Where an obstacle was in the way of the last plan, only the sides of the obstacles are sought
+    from here, and one program about that plan has to do.
+
     Args:
         at: The step.
         settings: How to descend.
         last: The nominal plan, which knows the free plan of the step before; or None.
         known: The free plan of the same step at other points.
     """
-    problem, N = at.problem, at.problem.horizon
-    active = np.zeros(at.layout.size - at.layout.boxed.start, dtype=np.intp)
+    problem = at.problem
     sizes = np.full(problem.max_obstacles, problem.size.reference)
-    limit = settings.max_iterations
+    search = TrustRegion(at, None, settings)
+    if last is not None and last.touches:
+        return _rough(at, search, at.start(last.inputs, sizes, None, _deviations(at, last)))
     if known is not None and known.inputs is not None:
-        start = at.start(known.inputs, sizes, None)
-        active = -np.sign(known.reaction).astype(np.intp)
-    elif last is not None:
-        # Both end in local optima only, so the better one counts; then none that is known is lost.
-        starts = [at.start(last.inputs, sizes, None, last.states[1:] - at.data.x_ref[1:])]
+        y, rolled = at.rolled(known.inputs, sizes)
+        point = at.certify(y, rolled, known.reaction, None)
+        _chart(search, point)
+        return FreePlan(point.y, point.reaction, lambda: point, known.inputs)
+    if last is None:
+        start = at.start(np.tile(problem.model.idle, (problem.horizon, 1)), sizes, None)
+    else:
+        # Both lead to local optima only, so the better one counts: no good plan is forgotten.
+        starts = [at.start(last.inputs, sizes, None, _deviations(at, last))]
         if last.free is not None:
             starts.append(at.start(last.free, sizes, None))
         start = min(starts, key=lambda point: at.merit(point.cost, 0.0, point.excess))
-        limit = min(limit, _ROUGH) if last.touches else limit
-    else:
-        start = at.start(np.tile(problem.model.idle, (N, 1)), sizes, None)
-    end = TrustRegion(at, None, settings).descend_from(start, active, limit)
-    if not at.charted:
-        raise np.linalg.LinAlgError("no plan to begin from has finite derivatives")
+    _chart(search, start)
+    nothing = np.zeros(len(at.chart.boxed), dtype=np.intp)
+    end = search.descend_from(start, nothing, settings.max_iterations)
     point = start if end is None else end.point
     return FreePlan(point.y, point.reaction, lambda: point, point.rolled.inputs)
+
+
+def _rough(at: CondensedStep, search: TrustRegion, start: Point) -> FreePlan:
+    _chart(search, start)
+    nothing = np.zeros(len(at.chart.boxed), dtype=np.intp)
+    for yields in at.ladder(firm=True):
+        with at.watch.solving:
+            held = at.solve(at.program(*at.nothing, yields), nothing)
+        if held is not None:
+            y = at.chart.y(held.v)
+            return replace(_certified(at, y, held.force), inputs=at.inputs(y))
+    return FreePlan(start.y, start.reaction, lambda: start, start.rolled.inputs)
+
+
+def _chart(search: TrustRegion, point: Point) -> None:
+    if not search.charted(point):
+        raise np.linalg.LinAlgError("no plan to begin from has finite derivatives")
+
+
+def _deviations(at: CondensedStep, last: Iterate) -> FloatArray:
+    return last.states[1:] - at.data.x_ref[1:]

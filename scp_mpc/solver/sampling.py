@@ -193,6 +193,45 @@ class NonlinearSampling(Sampling):
         )
         return positions, (C, D), at
 
+    def curvature(
+        self, states: FloatArray, inputs: FloatArray, nu: FloatArray, phi: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Second derivatives of nu' f and phi' p: (N, nx+nu, nx+nu) in x_i and u_i.
+
+        The second are those (N,) in the headings at the samples, to which discs add; or None.
+
+        Args:
+            states: (N+1, nx) of a plan.
+            inputs: (N, nu).
+            nu: (N, nx) multipliers of the dynamics.
+            phi: (N K n d,) forces on the positions.
+        """
+        before, K = states[None, :-1], self.instants
+        forces = np.swapaxes(phi.reshape(self._horizon, K, -1), 0, 1)
+        costates, shares = nu[None], np.ones((1, 1))
+        bent = np.zeros((self._horizon,) + (states.shape[1] + inputs.shape[1],) * 2)
+        if K > 1 and self._plain:
+            pulls = np.zeros((K - 1, *nu.shape))
+            pulls[:, :, self._position] = forces[:-1]
+        elif K > 1:
+            inner = self._model.linearise(before, inputs[None], self._shares)
+            pulls = (forces[:-1, :, None] @ self._slopes(inner.after))[:, :, 0]
+            turns = np.concatenate([inner.A, inner.B], axis=-1)[:, :, self._model.heading]
+            sway = self._sway(inner.after, forces[:-1])[..., None, None]
+            bent += (sway * turns[..., :, None] * turns[..., None, :]).sum(axis=0)
+        if K > 1:
+            costates, shares = np.concatenate([pulls, costates]), np.vstack([self._shares, shares])
+        bent += self._model.curvature(before, inputs[None], costates, shares).sum(axis=0)
+        return bent, None if self._plain else self._sway(states[1:], forces[-1])
+
+    def _sway(self, states: FloatArray, forces: FloatArray) -> FloatArray:
+        """Second derivatives (...) of forces' (..., n d) p in the heading."""
+        theta = states[..., self._model.heading, None]
+        ahead = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+        pushed = forces.reshape(*forces.shape[:-1], self.discs, -1)
+        sway: FloatArray = -(self._discs * (pushed * ahead).sum(axis=-1)).sum(axis=-1)
+        return sway
+
     def _bodies(self, states: FloatArray) -> FloatArray:
         """Centres (..., n, d) of the discs."""
         centre = states[..., None, self._position]

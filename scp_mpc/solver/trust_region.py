@@ -25,6 +25,7 @@ from scp_mpc.solver.conflicts import Conflicts, Tangent
 from scp_mpc.solver.curvature import bent_program, newton_step
 from scp_mpc.solver.descent import Descent
 from scp_mpc.solver.iterate import NEGLIGIBLE
+from scp_mpc.solver.sampling import NonlinearSampling
 from scp_mpc.solver.search import ROUNDING, End, Search
 from scp_mpc.solver.varying import Varying, VaryingChart
 
@@ -68,6 +69,8 @@ class TrustRegion(Search):
         tangent = None if conflicts is None else conflicts.tangent(y)
         with step.watch.solving:
             start = step.start(step.inputs(y), y[step.layout.s], conflicts, guess)
+        if not self.charted(start):
+            return None
         return self.descend_from(start, active, limit, began, tangent)
 
     def descend_from(
@@ -78,11 +81,9 @@ class TrustRegion(Search):
         began: float = 0.0,
         tangent: Tangent | None = None,
     ) -> End | None:
-        """Descend from a plan; the first half-spaces are a tangent's, if one is given."""
+        """Descend from a charted plan; the first half-spaces are a tangent's, if one is given."""
         watch, first = self._step.watch, self._step.condensed.sampling.first
         point, end, residual = start, None, np.inf
-        if not self._charted(start):
-            return None
         for iteration in range(1, limit + 1):
             task = first if iteration == 1 else "program"
             if iteration > 1:
@@ -95,7 +96,7 @@ class TrustRegion(Search):
                 break
             accepted, trial, held = attempt
             done = trial.residuals.worst <= self._tolerance
-            if not (accepted and (done or self._charted(trial))):
+            if not (accepted and (done or self.charted(trial))):
                 self._shrink(point, held)
                 if self._radius < _SMALLEST:
                     break
@@ -133,7 +134,7 @@ class TrustRegion(Search):
     def _tangent(self, point: Point) -> Tangent | None:
         return None if point.pushed is None else point.pushed.tangent
 
-    def _charted(self, point: Point) -> bool:
+    def charted(self, point: Point) -> bool:
         """Chart the problem about a plan, if its derivatives are such that it can be done."""
         with self._step.watch.linearising:
             condensed = self._step.condensed
@@ -213,12 +214,14 @@ class TrustRegion(Search):
             bends = np.einsum("kwm,kwn->kmn", L, conflicts.response(chart)[pairs])
             bends = bends.reshape(-1, bends.shape[-1])
         rolled, e = self._about.rolled, chart.guess(held.v)
-        nu = step.costates(rolled, e, held.force[:bounds], pushed)
-        states = step.data.x_ref.copy()
+        nu, phi = step.costates(rolled, e, held.force[:bounds], pushed)
+        model, states = step.problem.model, step.data.x_ref.copy()
         states[0] = step.data.x0
         states[1:] += rolled.deviations
-        hessians = step.problem.model.curvature(states[:-1], rolled.inputs, -nu)
-        return chart.curvature(hessians) - bends.T @ bends
+        sampling = step.condensed.sampling
+        assert isinstance(sampling, NonlinearSampling)
+        bent = sampling.curvature(states, rolled.inputs, -nu, -phi)
+        return chart.curvature(*bent, model.heading) - bends.T @ bends
 
     def _accepted(
         self,

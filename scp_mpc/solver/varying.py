@@ -51,10 +51,13 @@ class VaryingChart(Chart):
         e: FloatArray = self.deviations + self.G @ moved
         return e
 
-    def curvature(self, hessians: FloatArray) -> FloatArray:
+    def curvature(
+        self, hessians: FloatArray, sway: FloatArray | None, heading: int | None
+    ) -> FloatArray:
         """Second derivatives (nv, nv) of what hessians (N, nx+nu, nx+nu) of all stages add up to.
 
-        State 0 is given; the others respond to the inputs by G.
+        State 0 is given; the others respond to the inputs by G. `sway` (N,) are second derivatives
+        in one of the entries of states 1 .. N, the heading.
         """
         N, nx, n = self.G.shape
         x, u, later, G = slice(nx), slice(nx, None), hessians[1:], self.G[:-1]
@@ -62,6 +65,9 @@ class VaryingChart(Chart):
         W[n // N :] = (later[:, u, x] @ G).reshape(-1, n)
         W += W.T
         W += (later[:, x, x] @ G).reshape(-1, n).T @ G.reshape(-1, n)
+        if sway is not None:
+            turns = self.G[:, heading]
+            W += (turns * sway[:, None]).T @ turns
         stages = W.reshape(N, n // N, N, n // N)
         i = np.arange(N)
         stages[i, :, i] += hessians[:, u, u]
@@ -92,10 +98,11 @@ class Varying(Condensation):
         N, nu = self.layout.shape
         self._effort = np.kron(np.eye(N), 2 * problem.R)
         self._unit = np.eye(N * nu)
+        self._charted: tuple[Rolled, FloatArray, VaryingChart] | None = None
 
     def begin(self, step: StepData) -> None:
         """See the base class."""
-        self._step = step
+        self._step, self._charted = step, None
 
     def rolled(self, inputs: FloatArray, guess: FloatArray | None = None) -> Rolled:
         """See the base class."""
@@ -114,7 +121,10 @@ class Varying(Condensation):
         return Rolled(inputs, states[1:] - x_ref[1:], positions - self._step.track[1:], motion)
 
     def chart(self, rolled: Rolled, s: FloatArray) -> VaryingChart:
-        """Chart the problem about a plan with sizes s (M,)."""
+        """Chart the problem about a plan with sizes s (M,); twice about the same is once."""
+        known = self._charted
+        if known is not None and known[0] is rolled and np.array_equal(known[1], s):
+            return known[2]
         problem, layout, motion = self._problem, self.layout, rolled.motion
         assert isinstance(motion, VaryingMotion)
         N, nu = layout.shape
@@ -139,7 +149,9 @@ class Varying(Condensation):
             states[1:] += e
             return problem.cost(states, u, s, self._step.x_ref) - float(here @ here) / 2
 
-        return VaryingChart(y - S @ here, S, S[layout.boxed], cost_free, here, e, G, back)
+        chart = VaryingChart(y - S @ here, S, S[layout.boxed], cost_free, here, e, G, back)
+        self._charted = rolled, s, chart
+        return chart
 
     def _about(self, states: FloatArray, inputs: FloatArray) -> tuple[VaryingMotion, FloatArray]:
         """The motion along states (N+1, nx), without positions, and the states it leads to."""
