@@ -97,12 +97,17 @@ class CondensedSCP:
 
     def unhindered(self) -> Descent | None:
         """The plan that ignores the obstacles, if it is clear of them all: none costs less."""
-        y = self._free.y
-        if self._at.data.within(self._at.path(y), y[self._layout.s], 0.0) is not None:
+        if not self._clear(self._free.y):
             return None
         point = self._free.point
-        certified = point.residuals.worst <= self._settings.tolerance
-        return self._ended(point, np.inf, 0) if certified else None
+        if point.residuals.worst > self._settings.tolerance:
+            return None
+        if self._search is TrustRegion and not self._clear(point.y):  # y may be linearised
+            return None
+        return self._ended(point, np.inf, 0)
+
+    def _clear(self, y: FloatArray) -> bool:
+        return self._at.data.within(self._at.path(y), y[self._layout.s], 0.0) is None
 
     def free(self) -> Iterate:
         """The plan that ignores the obstacles, which may not be clear of them."""
