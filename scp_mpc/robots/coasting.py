@@ -25,6 +25,8 @@ def coasting_brake(model: Model, x: FloatArray) -> FloatArray:
         then = model.linearise(first.after, model.idle)
         way = (then.after - first.after)[model.position]
         by_u = (then.A - np.eye(model.nx))[model.position] @ first.B
+        if not (np.isfinite(way).all() and np.isfinite(by_u).all()):
+            return model.idle.copy()  # LAPACK would print
         u -= np.linalg.lstsq(by_u, way, rcond=_CUT)[0]
     return u
 

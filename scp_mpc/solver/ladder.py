@@ -16,7 +16,6 @@ from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.plan import Status
 from scp_mpc.solver.program import KKTResiduals
 from scp_mpc.solver.step_data import StepData
-from scp_mpc.trajectory import rollout
 
 _AT_REST = 1e-9  # of an input, in its own unit, that is none
 
@@ -55,8 +54,12 @@ class Ladder:
         """Of two plans with a violation, a certified one, else the one with less."""
         if found.status.certified:
             return found
-        most = (float(end.iterate.slack.max(initial=0.0)) for end in (found, braking))
-        return min(zip(most, (found, braking), strict=True), key=lambda pair: pair[0])[1]
+        return min((found, braking), key=self._violation)
+
+    def _violation(self, end: Descent) -> float:
+        """The largest of a plan: of obstacles [m], or of its states' bounds."""
+        excess = self._problem.excess(end.iterate.states).max()
+        return float(np.maximum(end.iterate.slack.max(initial=0.0), excess))
 
     def keep(self, step: StepData, inputs: FloatArray) -> Descent:
         """Roll the last plan's inputs (N, nu) out from the state now."""
@@ -70,7 +73,7 @@ class Ladder:
         U, last = np.tile(rest, (problem.horizon, 1)), step.u_last
         for u in U:
             wanted = model.brake(x) - rest
-            if float(np.abs(wanted).max()) <= _AT_REST:
+            if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
                 break
             # As far as the bounds allow in the direction of what is wanted; inputs without any
             # room stay where they are.
@@ -86,11 +89,15 @@ class Ladder:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
         problem = self._problem
         states = self._rolled_out(step.x0, inputs)
+        lost = ~np.isfinite(states).all(axis=1)
+        if lost.any():  # where the model has no next state, it stays in the last one
+            states[lost] = states[int(lost.argmax()) - 1]
+            status = Status.FALLBACK if status.ok else status
         s = np.full(problem.max_obstacles, problem.size.reference)
         s[: step.count] = problem.size.lower  # all that a plan without a search can promise
         slack = np.zeros((problem.max_obstacles, step.sampling.points))
         slack[: step.count] = step.depths(step.sampling.positions(states, inputs), s)
-        most = max(float(slack.max(initial=0.0)), float(problem.excess(states).max()))
+        most = float(np.maximum(slack.max(initial=0.0), problem.excess(states).max()))  # or NaN
         if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
         cost = problem.cost(states, inputs, s, step.x_ref)
@@ -102,6 +109,9 @@ class Ladder:
         """States (N+1, nx) to which inputs lead."""
         model = self._problem.model
         if self._response is None:
-            return rollout(model.step, x0, inputs).states
+            states = [x0]
+            for u in inputs:
+                states.append(model.step(states[-1], u))
+            return np.array(states)
         after = self._drift @ x0 + self._response @ inputs.ravel()
         return np.concatenate([x0[None], after.reshape(-1, model.nx)])
