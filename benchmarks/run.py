@@ -10,6 +10,7 @@ scaling     (b) closed loops over horizons 5 to 200 and 1 to 50 obstacles, with 
 deadlines   closed loops among 12 obstacles with a deadline, and how late their steps end
 optimality  (d) plan costs against the best of 24 starts of IPOPT
 programs    QP solvers on recorded programs
+robots      closed loops of all robots, relative to the double integrator among 5 obstacles
 """
 
 import argparse

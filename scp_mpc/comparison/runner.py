@@ -7,13 +7,14 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from scp_mpc.comparison import deadlines, horizon_timing, optimality, programs, scaling
+from scp_mpc.comparison import deadlines, horizon_timing, optimality, programs, robots, scaling
 from scp_mpc.comparison.one_thread import in_one_thread
+from scp_mpc.comparison.robots_figure import robots_figure
 from scp_mpc.comparison.scaling_figure import scaling_figure
 from scp_mpc.comparison.timing_table import measured_on
 from scp_mpc.provenance import provenance
 
-BENCHMARKS = ("horizon", "scaling", "deadlines", "optimality", "programs")
+BENCHMARKS = ("horizon", "scaling", "deadlines", "optimality", "programs", "robots")
 
 
 def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], None]) -> None:
@@ -45,6 +46,10 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], None]
     elif name == "optimality":
         table = in_one_thread(optimality.rows, steps, optimality.STARTS, seed)
         _write(out, optimality.NAME, optimality.markdown(table), {"rows": table}, echo)
+    elif name == "robots":
+        table = in_one_thread(robots.rows, steps)
+        _write(out, robots.NAME, robots.markdown(table), {"rows": table}, echo)
+        _save(robots_figure(table), out / f"{robots.NAME}.png")
     else:
         table = in_one_thread(programs.rows, steps)
         _write(out, programs.NAME, programs.markdown(table), {"rows": table}, echo)
