@@ -76,7 +76,8 @@ class Sampling(ABC):
         K, stages = self.instants, np.moveaxis(values, axis, 0)
         share = np.arange(1, K + 1).reshape(-1, *[1] * (stages.ndim - 1)) / K
         before, after = stages[:-1, None], stages[1:, None]
-        inner = ((1 - share) * before + share * after).reshape(-1, *stages.shape[1:])
+        inner = (1 - share) * before + share * after
+        inner = inner.reshape(self._horizon * K, *stages.shape[1:])  # also without any obstacle
         inner = self.repeated(inner, axis=0)
         return np.moveaxis(np.concatenate([stages[:1], inner]), 0, axis)
 
