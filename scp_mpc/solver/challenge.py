@@ -54,13 +54,15 @@ class Challenge:
         self._problem, self._settings = problem, settings
 
     def wanted(self, best: Descent, due: bool) -> bool:
-        """Whether to try: the plan is not safe, or it is time to and an obstacle shapes it.
+        """Whether to try: an obstacle is entered, or shapes a plan that is not safe or is due.
 
-        Not where no program was solved: there is no time, or no solver.
+        Not where no program was solved: there is no time, or no solver. Nor where no obstacle has
+        to do with what is wrong, as with a start outside the states' bounds.
         """
         if not self._settings.sides or best.iterate.multipliers is None:
             return False
-        return not best.status.ok or (due and best.iterate.touches)
+        clear = float(best.iterate.slack.max(initial=0.0)) <= self._settings.tolerance
+        return not clear or ((due or not best.status.ok) and best.iterate.touches)
 
     def run(
         self,
