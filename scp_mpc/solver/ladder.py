@@ -51,15 +51,19 @@ class Ladder:
         return kept if kept is not None and kept.status.ok else self.brake(step)
 
     def lesser(self, found: Descent, braking: Descent) -> Descent:
-        """Of two plans with a violation, a certified one, else the one with less."""
+        """Of two plans with a violation, a certified one, else the one with less.
+
+        The largest slack and the largest excess of a state count at their prices.
+        """
         if found.status.certified:
             return found
-        return min((found, braking), key=self._violation)
+        return found if self._violation(found) <= self._violation(braking) else braking
 
     def _violation(self, end: Descent) -> float:
-        """The largest of a plan: of obstacles [m], or of its states' bounds."""
-        excess = self._problem.excess(end.iterate.states).max()
-        return float(np.maximum(end.iterate.slack.max(initial=0.0), excess))
+        problem, iterate = self._problem, end.iterate
+        most = problem.slack_weight * float(iterate.slack.max(initial=0.0))
+        most += problem.state_slack_weight * float(problem.excess(iterate.states).max())
+        return np.inf if np.isnan(most) else most
 
     def keep(self, step: StepData, inputs: FloatArray) -> Descent:
         """Roll the last plan's inputs (N, nu) out from the state now."""
