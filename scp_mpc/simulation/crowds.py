@@ -1,6 +1,6 @@
 """Several obstacles on and beside the reference circle: named problems for benchmarks and tests."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -57,8 +57,7 @@ class Crowd:
     ) -> Problem:
         """The report's problem with room for all obstacles."""
         single = Scenario(self.name, self.name, self.horizon).problem(inflation, margin, subsamples)
-        values = vars(single) | {"max_obstacles": self.count}
-        return Problem(**{name: values[name] for name in Problem.__dataclass_fields__})
+        return replace(single, max_obstacles=self.count)
 
     def start(self) -> FloatArray:
         """State (4,) on the reference at time 0."""
