@@ -106,7 +106,8 @@ class Engine:
 
     def sweep(self, iterate: Iterate) -> Sweep:
         """What an iterate does between its points."""
-        return self._swept(self.path(iterate))
+        known = self._swept(self.path(iterate))
+        return Sweep(known.chord, max(known.sag, self.sampling.sag(iterate.states, iterate.inputs)))
 
     def assumed(self, start: Iterate) -> Sweep:
         """What a plan found from an iterate is assumed to do there, at full input at most."""
@@ -115,7 +116,9 @@ class Engine:
 
     def free_sweep(self) -> Sweep:
         """What the plan that ignores the obstacles does between its points."""
-        return self._swept(self.free_path())
+        if isinstance(self.sampling, LinearSampling):
+            return self._swept(self.free_path())
+        return self.sweep(self.free())
 
     def unhindered(self) -> Descent | None:
         """See `CondensedSCP.unhindered`."""

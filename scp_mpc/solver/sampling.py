@@ -60,6 +60,10 @@ class Sampling(ABC):
         """Positions (n, d) in the state now (nx,)."""
         return x0[None, self._position]
 
+    def sag(self, states: FloatArray, inputs: FloatArray) -> float:  # noqa: ARG002
+        """How far a plan's path bends off its chords, where the points do not show it [m]."""
+        return 0.0
+
     @abstractmethod
     def track(self, states: FloatArray, inputs: int) -> FloatArray:
         """Positions (N K n, d) along states (N+1, nx) that deviations are added to."""
@@ -166,6 +170,13 @@ class NonlinearSampling(Sampling):
             inner = self._model.advance(states[None, :-1], inputs[None], self._shares)
             whole = np.concatenate([inner, whole])
         return np.swapaxes(self._bodies(whole), 0, 1).reshape(self.points, -1)
+
+    def sag(self, states: FloatArray, inputs: FloatArray) -> float:
+        """See the base class; at the middle between two instants."""
+        shares = np.arange(2 * self.instants + 1)[:, None] / (2 * self.instants)
+        path = self._bodies(self._model.advance(states[None, :-1], inputs[None], shares))
+        bend = path[1::2] - (path[:-1:2] + path[2::2]) / 2
+        return float(np.sqrt(np.add.reduce(bend * bend, axis=-1).max()))
 
     def track(self, states: FloatArray, inputs: int) -> FloatArray:  # noqa: ARG002
         """See the base class; on the straight way from sample to sample."""
