@@ -124,7 +124,7 @@ def complaints(problem, x0, made, plan, u_last):
     if not all(np.isfinite(v).all() for v in numbers):
         return ["not finite"]
     said = []
-    if (U > problem.u_max + 1e-9).any() or (U < problem.u_min - 1e-9).any():
+    if (problem.u_max + 1e-9 < U).any() or (problem.u_min - 1e-9 > U).any():
         said.append("an input is beyond its bounds")
     before = U[:1] if u_last is None else u_last[None]
     change = np.diff(np.concatenate([before, U]), axis=0)

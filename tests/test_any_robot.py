@@ -28,7 +28,8 @@ def drive(robot, seed, steps=2):
         obstacles = [obstacle for obstacle, _ in made]
         given = x.copy(), goal.copy()
         plan = mpc.step(x, goal, obstacles)
-        assert np.array_equal(x, given[0]) and np.array_equal(goal, given[1])
+        assert np.array_equal(x, given[0])
+        assert np.array_equal(goal, given[1])
         known = last if problem.limits_rates else None
         said += complaints(problem, x, made, plan, known)
         plans.append(plan)
@@ -83,7 +84,9 @@ def test_no_way_past_is_tried_where_a_bound_alone_is_violated():
     x = np.array([0.0, 0.0, 0.0, 4.0])
     plan = MPC(problem).step(x, x, [ObstaclePrediction.still(3, [0.0, 50.0], 0.2)])
     assert plan.status is Status.SOFTENED
-    assert not plan.candidates and plan.x_slack.max() > 1 and not plan.slack.any()
+    assert not plan.candidates
+    assert plan.x_slack.max() > 1
+    assert not plan.slack.any()
 
 
 def test_the_lesser_violation_counts_states():
@@ -98,14 +101,17 @@ def test_the_lesser_violation_counts_states():
         return Descent(lambda: point, 0.0, 0.0, none, Status.VIOLATING, 1)
 
     fast, slow, unknown = end(5.0), end(2.0), end(np.nan)
-    assert ladder.lesser(fast, slow) is slow and ladder.lesser(slow, fast) is slow
-    assert ladder.lesser(unknown, fast) is fast and ladder.lesser(fast, unknown) is fast
+    assert ladder.lesser(fast, slow) is slow
+    assert ladder.lesser(slow, fast) is slow
+    assert ladder.lesser(unknown, fast) is fast
+    assert ladder.lesser(fast, unknown) is fast
     assert ladder.lesser(end(0.0, 0.5), slow) is slow
 
 
 def test_a_crowds_problem_keeps_the_rest():
     crowd = Crowd(8, 3)
-    assert crowd.problem().max_obstacles == 3 and crowd.problem().subsamples == 1
+    assert crowd.problem().max_obstacles == 3
+    assert crowd.problem().subsamples == 1
 
 
 def test_copies_of_a_problem_are_as_frozen_and_plan_alike():
