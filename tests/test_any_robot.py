@@ -12,8 +12,9 @@ from scp_mpc import MPC, ObstaclePrediction, Problem, Settings
 from scp_mpc.robots import KinematicBicycle, Unicycle
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.solver import Status
+from scp_mpc.solver.challenge import Challenge
 from scp_mpc.solver.descent import Descent
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.solver.ladder import Ladder
 from scp_mpc.solver.program import KKTResiduals
 from scp_mpc.solver.sampling import Sampling
@@ -79,14 +80,14 @@ def test_sag_is_that_of_the_path_and_not_of_its_samples():
     assert sampling.sag(np.array(states), inputs) == pytest.approx(truth, rel=1e-3)
 
 
-def test_no_way_past_is_tried_where_a_bound_alone_is_violated():
-    problem = car(Unicycle(DT), x_max=[np.inf, np.inf, np.inf, 1.0])
-    x = np.array([0.0, 0.0, 0.0, 4.0])
-    plan = MPC(problem).step(x, x, [ObstaclePrediction.still(3, [0.0, 50.0], 0.2)])
-    assert plan.status is Status.SOFTENED
-    assert not plan.candidates
-    assert plan.x_slack.max() > 1
-    assert not plan.slack.any()
+@pytest.mark.parametrize(("slack", "force", "wanted"), [(0, 0, False), (0, 1, True), (1, 0, True)])
+def test_ways_past_are_tried_where_an_obstacle_matters(slack, force, wanted):
+    rows, none = np.ones((1, 3)), np.zeros((3, 4))
+    duals = Multipliers(none, none, np.zeros(1), -force * rows, 0 * rows)
+    point = Iterate(np.zeros((4, 4)), np.zeros((3, 2)), np.zeros(1), slack * rows, duals)
+    residuals = KKTResiduals(1.0, 1.0, 1.0)
+    end = Descent(lambda: point, 0.0, 0.0, residuals, Status.VIOLATING, 1)
+    assert Challenge(car(Unicycle(DT)), Settings()).wanted(end, due=False) is wanted
 
 
 def test_the_lesser_violation_counts_states():
