@@ -249,6 +249,8 @@ class Problem:
     def excess(self, states: FloatArray) -> FloatArray:
         """Return by how much states (N+1, nx) are outside their bounds at stages 1 .. N (N, nx)."""
         x = states[1:]
+        if not self.limits_states:
+            return np.zeros_like(x)
         return np.maximum(0.0, np.maximum(x - self.x_max, self.x_min - x))
 
     def penalty(self, slack: FloatArray, states: FloatArray) -> float:

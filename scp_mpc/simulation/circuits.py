@@ -111,7 +111,7 @@ class Circuit:
     def states(self, step: int) -> FloatArray:
         """Reference (N+1, nx) from a step on; robots that fly are to keep upright."""
         model = self.problem.model
-        t = model.dt * (step + np.arange(self.horizon + 1))
+        t: FloatArray = model.dt * (step + np.arange(self.horizon + 1, dtype=np.float64))
         p, speed = self._circle(_OMEGA * t, np.zeros(model.dim)), _R * _OMEGA
         v = _OMEGA * self._circle(_OMEGA * t + np.pi / 2, np.zeros(model.dim))
         if isinstance(model, DoubleIntegrator):
@@ -131,11 +131,11 @@ class Circuit:
         j = np.arange(self.count)
         speeds = (-1.0) ** j * np.array(_SPEEDS)[j % len(_SPEEDS)]
         a = 2 * np.pi * (j + 0.5)[:, None] / self.count + speeds[:, None] * times
-        return self._circle(a, self._drawn[0][:, None])
+        return self._circle(np.asarray(a, dtype=np.float64), self._drawn[0][:, None])
 
     def predictions(self, step: int) -> list[ObstaclePrediction]:
         """Each obstacle's true future, with covariances that grow along the horizon."""
-        t = self.problem.model.dt * np.arange(self.horizon + 1)
+        t: FloatArray = self.problem.model.dt * np.arange(self.horizon + 1, dtype=np.float64)
         means = self.positions(step * self.problem.model.dt + t)
         growth = (1.0 + 0.2 * t)[:, None, None]
         return [

@@ -26,6 +26,8 @@ from scp_mpc.solver.conflicts import Conflicts, Tangent
 from scp_mpc.solver.layout import Layout
 from scp_mpc.solver.program import KKTResiduals
 
+_NOTHING = np.zeros(0)
+
 
 @dataclass(frozen=True, eq=False)
 class Pushed:
@@ -96,29 +98,44 @@ class Certificate:
     def __init__(self, problem: Problem, layout: Layout) -> None:
         """Remember the problem."""
         self._problem, self._layout = problem, layout
+        idle = problem.model.idle
+        self._idle = idle if idle.any() else None
+
+    def track(self, e: FloatArray) -> FloatArray:
+        """Q e (N, nx): half the cost's gradient in deviations e."""
+        track = e @ self._problem.Q
+        track[-1] = e[-1] @ self._problem.Qf
+        return track
 
     def costates(
-        self, rolled: Rolled, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Multipliers nu (N, nx) at deviations e, forces on u (N, nu) and on s (M,)."""
-        problem, c = self._problem, self._layout
-        pull = -2 * (e @ problem.Q)
-        pull[-1] = -2 * (e[-1] @ problem.Qf)
-        on_u, on_s = np.zeros(c.shape), np.zeros(problem.max_obstacles)
+        self,
+        rolled: Rolled,
+        track: FloatArray,
+        reaction: FloatArray | None,
+        pushed: Pushed | None,
+    ) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+        """Multipliers nu (N, nx), and the forces on u (N, nu) and s (M,), or None for none.
+
+        Args:
+            rolled: The plan about which the dynamics are linearised.
+            track: (N, nx) half the cost's gradient in e.
+            reaction: (nf,) forces of the bounds, or None.
+            pushed: The obstacles' part.
+        """
+        c, pull = self._layout, -2 * track
+        on_u = on_s = None
         if pushed is not None:
             phi = pushed.on(c.size)
-            on_e, between = rolled.motion.pull(phi[c.p])
+            on_e, on_u = rolled.motion.pull(phi[c.p])
             pull += on_e
             on_s = phi[c.s]
-            if between is not None:
-                on_u = between
-        if reaction.any():
+        if reaction is not None:
             bound_e, bound_u = c.pushed(reaction)
-            on_u = on_u + bound_u
+            on_u = bound_u if on_u is None else on_u + bound_u
             if bound_e is not None:
                 pull += bound_e
             if c.moving:
-                on_s = on_s + reaction[: c.moving]
+                on_s = reaction[: c.moving] if on_s is None else on_s + reaction[: c.moving]
         return rolled.motion.costates(pull), on_u, on_s
 
     def certify(
@@ -141,35 +158,37 @@ class Certificate:
         problem, c = self._problem, self._layout
         u, e, w = rolled.inputs, rolled.deviations, problem.size.weight
         away = y[c.s] - problem.size.reference
-        push = u - problem.model.idle
-        track, effort = e @ problem.Q, push @ problem.R
-        track[-1] = e[-1] @ problem.Qf
+        push = u if self._idle is None else u - self._idle
+        track, effort = self.track(e), push @ problem.R
         cost = float(np.vdot(track, e) + np.vdot(effort, push) + w * (away @ away))
         scale = max(1.0, 2 * float(np.abs(track).max()), 2 * float(np.abs(effort).max()))
-        nu, on_u, on_s = self.costates(rolled, e, reaction, pushed)
-        stationarity = float(np.abs(2 * effort - rolled.motion.thrust(nu) - on_u).max())
+        force = reaction if reaction.any() else None
+        nu, on_u, on_s = self.costates(rolled, track, force, pushed)
+        thrust = 2 * effort - rolled.motion.thrust(nu)
+        if on_u is not None:
+            thrust -= on_u
+        stationarity = float(np.abs(thrust).max())
         if c.moving:
-            stationarity = max(stationarity, float(np.abs(2 * w * away - on_s).max()))
+            pull = 2 * w * away if on_s is None else 2 * w * away - on_s
+            stationarity = max(stationarity, float(np.abs(pull).max()))
         feasibility = product = 0.0
         if pushed is not None:
             gap = pushed.tangent.g + pushed.slack
             feasibility = max(0.0, -float(gap.min()))
             product = max(-float(pushed.force.min()), float(np.abs(pushed.force * gap).max()))
-        lower, upper = (b[c.boxed] for b in bounds)
-        boxed = y[c.boxed]
-        excess = np.zeros(0)
-        if c.size > c.u.stop:  # changes and states can be beyond their bounds; nothing else can
-            beyond = np.maximum(0.0, np.maximum(lower - boxed, boxed - upper))
-            excess = beyond[c.yielding]
-            firm = beyond[: c.yielding.start].max()
-            yields = np.abs(reaction[c.yielding]) >= problem.state_slack_weight
-            feasibility = max(
-                feasibility, float(firm), float(np.where(yields, 0.0, excess).max(initial=0.0))
-            )
-        if reaction.any():
-            room = np.where(reaction > 0, boxed - lower, upper - boxed)
-            if len(excess):
-                room[c.yielding] += np.where(yields, excess, 0.0)
-            product = max(product, float(np.abs(reaction * room)[reaction != 0].max()))
+        excess = _NOTHING
+        if force is not None or c.size > c.u.stop:
+            (lower, upper), boxed = bounds, y[c.boxed]
+            below, above = boxed - lower[c.boxed], upper[c.boxed] - boxed
+            slack = np.zeros(len(boxed))
+            if c.size > c.u.stop:  # only changes and states can be beyond their bounds
+                beyond = np.maximum(0.0, -np.minimum(below, above))
+                excess = beyond[c.yielding]
+                yields = np.abs(reaction[c.yielding]) >= problem.state_slack_weight
+                slack[c.yielding] = np.where(yields, excess, 0.0)
+                feasibility = max(feasibility, float((beyond - slack).max()))
+            if force is not None:
+                room = np.abs(force * (np.where(force > 0, below, above) + slack))
+                product = max(product, float(room[force != 0].max()))
         residuals = KKTResiduals(stationarity / scale, feasibility, product / max(1.0, cost))
         return Point(y, rolled, nu, reaction, pushed, cost, residuals, excess)

@@ -160,7 +160,7 @@ class CondensedStep:
         self, rolled: Rolled, e: FloatArray, reaction: FloatArray, pushed: Pushed | None
     ) -> tuple[FloatArray, FloatArray]:
         """Multipliers nu (N, nx) and forces (C d,) on positions; see `Certificate.costates`."""
-        nu = self._certificate.costates(rolled, e, reaction, pushed)[0]
+        nu = self._certificate.costates(rolled, self._certificate.track(e), reaction, pushed)[0]
         phi = np.zeros(self.layout.p.stop)
         if pushed is not None:
             phi = pushed.on(self.layout.size)[self.layout.p]

@@ -55,8 +55,8 @@ def free_linear(
             return _certified(at, y, plan.reaction)
         at.chart = condensed.chart()
     y, nothing = at.chart.y_free, np.zeros(len(at.chart.boxed))
-    lower, upper = (bound[at.layout.boxed] for bound in at.bounds)
-    if (lower <= y[at.layout.boxed]).all() and (upper >= y[at.layout.boxed]).all():
+    (lower, upper), box = at.bounds, at.layout.boxed
+    if (lower[box] <= y[box]).all() and (upper[box] >= y[box]).all():
         at.finished["kkt"] += 1
         return _certified(at, y, nothing)
     for yields in at.ladder(firm=True):
