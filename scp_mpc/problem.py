@@ -184,6 +184,13 @@ class Problem:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Freeze again: neither pickle nor deepcopy keeps arrays read-only."""
+        self.__dict__.update(state)
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                frozen(value)
+
     @cached_property
     def no_go(self) -> Inflation:
         """The inflation's geometry."""
