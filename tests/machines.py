@@ -6,11 +6,27 @@ import numpy as np
 from instances import rotated
 
 from scp_mpc import Margin, ObstaclePrediction, Problem
-from scp_mpc.robots import KinematicBicycle, Model, PlanarQuadrotor, Quadrotor, Unicycle
+from scp_mpc.robots import (
+    FunctionModel,
+    KinematicBicycle,
+    Model,
+    PlanarQuadrotor,
+    Quadrotor,
+    Unicycle,
+)
 
 DT = 0.15
 SIZE = 2.0
 KINDS = ("ahead", "beside", "crossing", "elongated")
+DRAG = 0.3
+
+
+def dragged(x, u):
+    """A point mass whose drag grows with the square of its speed."""
+    speed = np.sqrt(0.01 + x[..., 2:3] ** 2 + x[..., 3:] ** 2)
+    return np.concatenate([x[..., 2:], u - DRAG * speed * x[..., 2:]], axis=-1)
+
+
 MODELS = {
     "unicycle": (Unicycle(DT), [1.0, 1.0, 0.1, 0.1], [0.1, 0.1], [2.0, 2.0]),
     "bicycle": (
@@ -30,6 +46,14 @@ MODELS = {
         [1.0, 1.0, 1.0, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05],
         [0.01, 0.05, 0.05, 0.05],
         [6.0, 3.0, 3.0, 2.0],
+    ),
+    "function": (
+        FunctionModel(
+            dragged, "complex", nx=4, nu=2, dt=DT, position=[0, 1], vectorised=True, substeps=4
+        ),
+        [1.0, 1.0, 0.1, 0.1],
+        [0.1, 0.1],
+        [3.0, 3.0],
     ),
 }
 

@@ -73,8 +73,10 @@ class ModelReferee:
         sides = casadi.SX.sym("n", self.width, N * len(obstacles))
         weights = [casadi.DM(W) for W in (problem.Q, problem.Qf, problem.R)]
         cost, rows, lower, upper = 0, [], [], []
+        self.kinds: list[str] = []  # of all rows
 
-        def demand(row, low, high):
+        def demand(kind, row, low, high):
+            self.kinds += [kind] * row.numel()
             rows.append(row)
             lower.append(np.broadcast_to(low, row.numel()))
             upper.append(np.broadcast_to(high, row.numel()))
@@ -85,22 +87,22 @@ class ModelReferee:
             cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(
                 weights[2], U[:, i] - idle
             )
-            demand(X[:, i] - advance(previous, U[:, i]), 0.0, 0.0)
+            demand("dynamics", X[:, i] - advance(previous, U[:, i]), 0.0, 0.0)
             previous = X[:, i]
             before = U[:, i - 1] if i else (None if u_before is None else casadi.DM(u_before))
             if before is not None and {"du_min", "du_max"} & set(bounds):
                 low, high = bounds.get("du_min", -np.inf), bounds.get("du_max", np.inf)
-                demand(U[:, i] - before, low, high)
+                demand("rates", U[:, i] - before, low, high)
             for j, obstacle in enumerate(obstacles):
                 n = sides[:, j * N + i]
                 if self.dim == 2:
                     n = casadi.vertcat(casadi.cos(n), casadi.sin(n))
                 else:
-                    demand(casadi.sumsqr(n), -np.inf, 1.0)
+                    demand("unit", casadi.sumsqr(n), -np.inf, 1.0)
                 spread = casadi.sqrt(casadi.bilin(casadi.DM(obstacle.covariances[i + 1]), n))
                 delta = X[self.position, i] - casadi.DM(obstacle.means[i + 1])
                 reach = problem.robot_radius + obstacle.radius
-                demand(casadi.dot(n, delta) - self.size * spread, reach, np.inf)
+                demand("obstacles", casadi.dot(n, delta) - self.size * spread, reach, np.inf)
         w = casadi.vertcat(casadi.vec(X), casadi.vec(U), casadi.vec(sides))
         self.nlp = {"x": w, "f": cost, "g": casadi.vertcat(*rows)}
         self.rows = np.concatenate(lower), np.concatenate(upper)
@@ -128,6 +130,43 @@ class ModelReferee:
         inputs = w[N * self.nx : N * (self.nx + self.nu)].reshape(N, self.nu)
         ok = bool(solver.stats()["success"])
         return Verdict(np.vstack([X[:1], ends]), inputs, float(result["f"]), ok)
+
+    def kkt(self, plan) -> dict[str, float]:
+        """KKT residuals of the original problem at a plan and its multipliers.
+
+        One point in each interval; rates are not looked at.
+        """
+        duals, (x, f, g) = plan.multipliers, (self.nlp[key] for key in "xfg")
+        kinds, y = np.array(self.kinds), casadi.SX.sym("y", g.numel())
+        gradient = casadi.gradient(f + casadi.dot(y, g), x)
+        evaluate = casadi.Function("kkt", [x, y], [gradient, g])
+        values = np.zeros(len(kinds))
+        values[kinds == "dynamics"] = duals.dynamics.ravel()
+        # The rows go by stage, then by obstacle.
+        values[kinds == "obstacles"] = duals.obstacles[: len(self.obstacles)].T.ravel()
+        w = np.concatenate([plan.X[1:].ravel(), plan.U.ravel()])
+        slope, rows = evaluate(np.append(w, self._sides(plan.X[1:, self.position])), values)
+        slope, rows, count = np.array(slope).ravel(), np.array(rows).ravel(), len(w)
+        forces = np.zeros(count)
+        if duals.states.size:
+            on_x = forces[: self.problem.horizon * self.nx].reshape(-1, self.nx)
+            on_x[:, self.problem.bounded_states] = duals.states
+        forces[self.problem.horizon * self.nx :] = duals.inputs.ravel()
+        low, high = (bound[:count] for bound in self.box)
+        room = np.where(forces > 0, high - w, w - low)
+        gap = (rows - self.rows[0])[kinds == "obstacles"]
+        push = values[kinds == "obstacles"]
+        pushed = forces != 0
+        return {
+            "stationarity": np.abs(slope[:count] + forces).max(),
+            "defect": np.abs(rows[kinds == "dynamics"]).max(),
+            "violation": max(0.0, (low - w).max(), (w - high).max(), -gap.min(initial=0.0)),
+            "sign": push.max(initial=0.0),
+            "complementarity": max(
+                np.abs(push * gap).max(initial=0.0),
+                np.abs(forces[pushed] * room[pushed]).max(initial=0.0),
+            ),
+        }
 
     def normals(self, positions: np.ndarray) -> np.ndarray:
         """Outward normals (M, N, d) at positions (N, d), by search in ever smaller caps."""
