@@ -203,3 +203,10 @@ def test_bent_program_has_the_bent_hessian(shift):
     np.testing.assert_allclose(bent.A @ w - bent.b, p.A @ v - p.b, atol=1e-9)
     np.testing.assert_allclose(bent.F @ w - bent.lower, p.F @ v - p.lower, atol=1e-9)
     np.testing.assert_allclose(bent.upper - bent.F @ w, p.upper - p.F @ v, atol=1e-9)
+
+
+def test_a_good_guess_needs_no_walk(bench, monkeypatch):
+    guess = bench.varying.rolled(bench.inputs).deviations
+    guess += 1e-4 * bench.rng.normal(size=guess.shape)
+    monkeypatch.setattr(type(bench.model), "step", None)
+    bench.varying.rolled(bench.inputs, guess)
