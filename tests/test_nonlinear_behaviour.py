@@ -19,6 +19,7 @@ from scp_mpc import (
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.robots import FunctionModel
 from scp_mpc.solver import engine
+from scp_mpc.solver.sweep import Sweep
 from scp_mpc.solver.trust_region import TrustRegion
 from scp_mpc.trajectory import rollout
 
@@ -48,8 +49,10 @@ def depths(plan, problem, obstacle, fine=20):
 @pytest.mark.parametrize("subsamples", [1, 4])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_function_that_is_linear_gives_the_linear_plan(seed, subsamples, monkeypatch):
-    # A linear robot leaves room for what full inputs would bend between points.
-    monkeypatch.setattr(engine, "_full_sag", lambda *_: 0.0)
+    # What bends between two points is measured in other ways for a linear robot.
+    for measured in ("assumed", "sweep"):
+        monkeypatch.setattr(engine.Engine, measured, lambda *_: Sweep(0.35, 0.01))
+    monkeypatch.setattr(engine.Engine, "free_sweep", lambda *_: Sweep(0.35, 0.01))
     linear = DoubleIntegrator(DT, 2)
 
     def function(x, u):

@@ -114,23 +114,28 @@ def test_chart_is_the_derivative(bench):
 
 
 def test_curvature_is_the_second_difference(bench):
-    """Of sum_i nu_i' x_i + cost: what the chart's Gauss-Newton Hessian I leaves out is W."""
+    """Of forces' x + phi' p: what the chart's Gauss-Newton Hessian I leaves out is W."""
     rolled = bench.varying.rolled(bench.inputs)
     chart = bench.varying.chart(rolled, bench.s)
     forces = bench.rng.normal(size=rolled.deviations.shape)
-    nu = rolled.motion.costates(forces)
+    sampling = bench.varying.sampling
+    phi = bench.rng.normal(size=rolled.positions.size)
+    nu = rolled.motion.costates(forces + rolled.motion.pull(phi)[0])
     states = bench.walked(bench.inputs)
-    hessians = bench.model.curvature(states[:-1], bench.inputs, nu)
-    W = chart.curvature(hessians)
+    bends = sampling.curvature(states, bench.inputs, nu, phi)
+    W = chart.curvature(*bends, bench.model.heading)
     np.testing.assert_allclose(W, W.T, atol=1e-9)
+
+    def pushed(inputs):
+        walked = bench.walked(inputs)
+        return np.vdot(forces, walked[1:]) + phi @ sampling.positions(walked, inputs).ravel()
+
     h = 1e-3
     for _ in range(3):
         v = bench.rng.normal(size=len(chart.here))
         v /= np.linalg.norm(v)
         move = h * (chart.back @ v).reshape(bench.inputs.shape)
-        ahead, here, behind = (
-            np.vdot(forces, bench.walked(bench.inputs + k * move)[1:]) for k in (1, 0, -1)
-        )
+        ahead, here, behind = (pushed(bench.inputs + k * move) for k in (1, 0, -1))
         bent = (ahead - 2 * here + behind) / h**2
         assert v @ W @ v == pytest.approx(bent, abs=1e-4 * max(1.0, np.abs(W).max()))
     assert np.abs(W).max() > 1e-3
