@@ -6,18 +6,29 @@ import pytest
 from scp_mpc.comparison import wind
 from scp_mpc.comparison.wind_figure import wind_figure
 from scp_mpc.comparison.wind_table import markdown
-from scp_mpc.comparison.wind_variants import ALONE, CALM, FORESIGHT, MAIN, OTHERS, Variant
+from scp_mpc.comparison.wind_variants import (
+    ALONE,
+    BEST,
+    CALM,
+    EXACT,
+    FORESIGHT,
+    MAIN,
+    NOMINAL,
+    OTHERS,
+    REPORT,
+    Variant,
+)
 
 
 def test_variants_are_all_different_and_named_so():
-    variants = [*MAIN, *CALM, *ALONE, *FORESIGHT, *OTHERS]
+    variants = [*MAIN, *CALM, *ALONE, *FORESIGHT, *OTHERS, *EXACT]
     assert len({variant.name for variant in variants}) == len(variants)
     assert (MAIN[0].horizon, MAIN[0].rejects, MAIN[0].thrift) == (30, False, None)
     assert all(row.disturbance == "report's wind" for row in MAIN)
 
 
 def test_all_variants_meet_the_same_wind():
-    runs = [variant.run(seed=3, steps=5) for variant in (MAIN[1], MAIN[4])]
+    runs = [variant.run(seed=3, steps=5) for variant in (NOMINAL, BEST)]
     pushed = [
         run.states[1:]
         - [run.problem.model.step(x, u) for x, u in zip(run.states, run.inputs, strict=False)]

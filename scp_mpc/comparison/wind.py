@@ -84,7 +84,9 @@ def measured(
     store: Path | None = None,
     workers: int = 1,
 ) -> list[Row]:
-    """One row per variant; it is compared with the first one under the same disturbance.
+    """One row per variant, compared with the first one under the same disturbance.
+
+    Where one keeps to its side, as the report's solver does, all are compared with that one, too.
 
     Args:
         variants: What to run.
@@ -109,11 +111,24 @@ def measured(
         for variant in variants
     }
     first = {variant.disturbance: runs[variant] for variant in reversed(variants)}
-    return [summary(v, runs[v], first[v.disturbance]) for v in variants]
+    report = {v.disturbance: runs[v] for v in reversed(variants) if not v.sides}
+    return [summary(v, runs[v], first[v.disturbance], report.get(v.disturbance)) for v in variants]
 
 
-def summary(variant: Variant, runs: Sequence[Row], base: Sequence[Row]) -> Row:
-    """Means over the seeds with their intervals, and the difference to others in the same winds."""
+def summary(
+    variant: Variant,
+    runs: Sequence[Row],
+    base: Sequence[Row],
+    report: Sequence[Row] | None = None,
+) -> Row:
+    """Means over the seeds with their intervals, and the difference to others in the same winds.
+
+    Args:
+        variant: What ran.
+        runs: What came of it.
+        base: Of the first variant.
+        report: Of the first one that keeps to its side.
+    """
     rms, other = (np.array([run["rms"] for run in which]) for which in (runs, base))
     middle = np.array([run["median"] for run in runs])
     row: Row = asdict(variant) | {"name": variant.name, "controller": variant.controller}
@@ -126,6 +141,9 @@ def summary(variant: Variant, runs: Sequence[Row], base: Sequence[Row]) -> Row:
     row["rms_mean"], row["rms_interval"] = float(rms.mean()), interval(rms)
     row["usual"], row["usual_interval"] = float(middle.mean()), interval(middle)
     row["excess"], row["excess_interval"] = float((rms - other).mean()), interval(rms - other)
+    if report is not None:
+        beyond = rms - np.array([run["rms"] for run in report])
+        row["beyond"], row["beyond_interval"] = float(beyond.mean()), interval(beyond)
     row["clearance"] = min(run["clearance"] for run in runs)
     row["distance"] = min(run["distance"] for run in runs)
     row |= {key: sum(run[key] for run in runs) for key in ("contact", "slack", "not_ok")}

@@ -1,6 +1,7 @@
 """The closed loops that are compared under wind: a controller, a horizon, a disturbance.
 
-nominal         `MPC`, which knows of no disturbance: the report
+nominal         `MPC`, which knows of no disturbance
+keeps its side  the same from the last plan alone: the report's local SQP
 rejection       `WindAwareMPC`, its estimator told what kind of disturbance there is, foresight off
 + terminal      the same, with the cost-to-go of a regulator as terminal weight (`THRIFT`)
 + spread        the same, with the robot's own spread in the no-go sets
@@ -56,6 +57,7 @@ class Variant:
         foresight: See `WindAwareMPC`.
         obstacle: Whether there is one.
         inflation: Of the no-go set.
+        sides: Whether other ways past the obstacle are tried; the report keeps to its side.
     """
 
     horizon: int
@@ -65,6 +67,7 @@ class Variant:
     foresight: Foresight = "none"
     obstacle: bool = True
     inflation: str = "axes"
+    sides: bool = True
 
     @property
     def random(self) -> bool:
@@ -77,6 +80,8 @@ class Variant:
         words = "rejection" if self.rejects else "nominal"
         if self.thrift is not None:
             words += " + terminal"
+        if not self.sides:
+            words += ", keeps its side"
         return words if self.foresight == "none" else f"{words} + spread, {self.foresight}"
 
     @property
@@ -95,7 +100,10 @@ class Variant:
         if not self.obstacle:
             scenario = replace(scenario, obstacle=replace(scenario.obstacle, track_radius=_FAR))
         problem = scenario.problem("exact" if self.inflation == "exact" else "axes")
-        return simulate(scenario, problem, steps=steps, seed=seed, controller=self._controller)
+        settings = Settings(sides=self.sides)
+        return simulate(
+            scenario, problem, settings, steps=steps, seed=seed, controller=self._controller
+        )
 
     def _controller(self, problem: Problem, settings: Settings | None) -> Controller:
         fades = self.disturbance in ("report's wind", "none")
@@ -113,17 +121,22 @@ class Variant:
         return MPC(problem, settings)
 
 
+OURS, REPORT = Variant(30, False), Variant(30, False, sides=False)
+NOMINAL, BEST = Variant(8, False), Variant(8, True, thrift=THRIFT)
 MAIN = (
-    Variant(30, False),
-    Variant(8, False),
+    OURS,
+    REPORT,
+    NOMINAL,
+    Variant(8, False, sides=False),
     Variant(8, False, thrift=THRIFT),
     Variant(8, True),
-    Variant(8, True, thrift=THRIFT),
+    BEST,
     Variant(8, True, thrift=THRIFT, foresight="closed loop"),
     Variant(30, True),
 )
 CALM = (
     Variant(30, False, "none"),
+    Variant(30, False, "none", sides=False),
     Variant(8, False, "none"),
     Variant(8, True, "none"),
     Variant(8, True, "none", thrift=THRIFT),
@@ -136,7 +149,7 @@ ALONE = (
 FORESIGHT = tuple(
     Variant(30, True, foresight=foresight) for foresight in ("closed loop", "open loop")
 )
-EXACT = tuple(replace(variant, inflation="exact") for variant in (MAIN[0], MAIN[1], MAIN[4]))
+EXACT = tuple(replace(variant, inflation="exact") for variant in (OURS, REPORT, NOMINAL, BEST))
 OTHERS = tuple(
     variant
     for name in tuple(DISTURBANCES)[2:]
