@@ -7,7 +7,8 @@ Row = dict[str, Any]
 
 _HEAD = (
     "| N | Controller | Disturbance | Runs | RMS error [m]: mean (95 %) | median "
-    "| Difference (95 %) | To the report's way (95 %) | Median error [m] | Least clearance [m] | Contacts | Slack steps |\n"
+    "| Difference (95 %) | To the report's way (95 %) | Median error [m] | Least clearance [m] "
+    "| Contacts | Slack steps |\n"
     "|--:|:--|:--|--:|:--|--:|:--|:--|--:|--:|--:|--:|"
 )
 _GROUPS = {
@@ -24,10 +25,9 @@ def markdown(groups: Mapping[str, Sequence[Row]], steps: int) -> str:
     """All groups with a line of explanation each."""
     parts = [
         f"{steps} steps per run; the same winds for all variants. The difference is to the first "
-        "row with the same disturbance, wind by wind; the report's way is N = 30, nominal, from the "
-        "last plan alone. Error: distance from the reference of the "
-        "same time; its RMS is over a run, mean and median are over the runs. Clearance: from the "
-        "no-go set."
+        "row with the same disturbance, wind by wind; the report's way is N = 30, nominal, from "
+        "the last plan alone. Error: distance from the reference of the same time; its RMS is over "
+        "a run, mean and median are over the runs. Clearance: from the no-go set."
     ]
     for group, rows in groups.items():
         if not rows:

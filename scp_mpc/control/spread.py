@@ -60,6 +60,10 @@ class PositionSpread:
         if foresight == "closed loop":
             model = estimator.model
             self._loop = model.A - model.B @ Regulator(problem, model, thrift).feedback
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was propagated last."""
         self._known: tuple[FloatArray, FloatArray] | None = None
 
     def along(self, covariance: FloatArray) -> FloatArray | None:

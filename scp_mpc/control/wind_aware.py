@@ -7,6 +7,7 @@ Wind aside, nothing changes: with a disturbance of zero the plan is that of `MPC
 
 from collections.abc import Sequence
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,7 @@ from scp_mpc.control.estimator import DisturbanceEstimator, Estimate
 from scp_mpc.control.mpc import MPC
 from scp_mpc.control.regulator import Regulator
 from scp_mpc.control.spread import Foresight, PositionSpread
-from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.disturbed import Disturbed
@@ -71,6 +72,7 @@ class WindAwareMPC:
         self._mpc = MPC(inner, settings)
         self._problem, self._estimator = problem, estimator
         self._applied: FloatArray | None = None
+        self._busy = Lock()
         estimator.reset()
 
     @property
@@ -117,6 +119,43 @@ class WindAwareMPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
+        self._enter()
+        try:
+            return self._step(y, x_ref, obstacles, applied, time, robot_covariance)
+        finally:
+            self._busy.release()
+
+    def reset(self) -> None:
+        """Forget all steps and all that was estimated.
+
+        Raises:
+            ConcurrentUseError: Another thread is using this controller.
+        """
+        self._enter()
+        try:
+            self._mpc.reset()
+            self._estimator.reset()
+            self._spread.reset()
+            self._applied = None
+        finally:
+            self._busy.release()
+
+    def _enter(self) -> None:
+        # The controller behind has a lock of its own, but the estimator comes before it.
+        if not self._busy.acquire(blocking=False):
+            raise ConcurrentUseError(
+                "this controller is at work in another thread; give each its own"
+            )
+
+    def _step(
+        self,
+        y: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        applied: ArrayLike | None,
+        time: float | None,
+        robot_covariance: ArrayLike | None,
+    ) -> Plan:
         model, problem = self._estimator.model, self._problem
         N, nx, d = problem.horizon, problem.model.nx, model.dim
         x_ref = as_array("x_ref", x_ref, (N + 1, nx), (nx,))
@@ -125,8 +164,8 @@ class WindAwareMPC:
             given = as_array("robot_covariance", robot_covariance, (d, d), (N + 1, d, d))
         before = self._estimator.estimate
         u = self._applied if applied is None else applied
-        now = self._estimator.update(y, u)
         try:
+            now = self._estimator.update(y, u)
             plan = self._mpc.step(
                 model.joined(now.state, now.disturbance),
                 model.joined(x_ref),
@@ -134,17 +173,11 @@ class WindAwareMPC:
                 time=time,
                 robot_covariance=_sum(self._spread.along(now.covariance), given),
             )
-        except Exception:
+        except BaseException:
             self._estimator.restore(before)
             raise
         self._applied = plan.u0
         return replace(plan, X=frozen(np.ascontiguousarray(plan.X[:, :nx])))
-
-    def reset(self) -> None:
-        """Forget all steps and all that was estimated."""
-        self._mpc.reset()
-        self._estimator.reset()
-        self._applied = None
 
 
 def disturbed(problem: Problem, model: Disturbed) -> Problem:
