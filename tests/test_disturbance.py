@@ -1,5 +1,6 @@
 """Disturbance rejection in closed loop."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from instances import instance, obstacle, problem, straight_reference
 from scp_mpc import (
     MPC,
     BoundsError,
+    ConcurrentUseError,
     DoubleIntegrator,
     InvalidArgumentError,
     LinearModel,
@@ -232,14 +234,55 @@ def test_errors_leave_no_trace():
         {"obstacles": things},
         {"applied": [1.0]},
         {"robot_covariance": -np.eye(2)},
+        {"time": np.nan},
     ):
         with pytest.raises(InvalidArgumentError):
             mpc.step(**{"y": x + 0.1, "x_ref": x_ref, **bad})
+        assert mpc.estimate.innovation.tobytes() == twin.estimate.innovation.tobytes()
     y = x + [0.1, 0.2, 0.0, 0.1]
     np.testing.assert_array_equal(mpc.step(y, x_ref).U, twin.step(y, x_ref).U)
     mpc.reset()
     assert mpc.estimate is None
     np.testing.assert_array_equal(mpc.step(y, x_ref).U, aware(p).step(y, x_ref).U)
+
+
+def test_a_second_thread_is_refused_before_anything_changes():
+    """It comes while the first waits inside its step, after the estimator's update."""
+    p = problem()
+    mpc, twin = aware(p, foresight="closed loop"), aware(p, foresight="closed loop")
+    x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
+    for each in (mpc, twin):
+        each.step(x, x_ref)
+
+    def waiting(pool):
+        before = mpc.estimate
+        for use in (lambda: mpc.step(x + 0.3, x_ref), mpc.reset):
+            with pytest.raises(ConcurrentUseError):
+                pool.submit(use).result()
+        assert mpc.estimate is before
+        yield obstacle(8, (1.5, 0.1))
+
+    with ThreadPoolExecutor(1) as pool:
+        watched = mpc.step(x + 0.1, x_ref, waiting(pool))
+    expected = twin.step(x + 0.1, x_ref, [obstacle(8, (1.5, 0.1))])
+    np.testing.assert_array_equal(watched.U, expected.U)
+    np.testing.assert_array_equal(mpc.step(x, x_ref).U, twin.step(x, x_ref).U)
+
+
+def test_an_interrupted_step_leaves_no_trace():
+    p = problem()
+    mpc, twin = aware(p), aware(p)
+    x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
+    for each in (mpc, twin):
+        each.step(x, x_ref)
+
+    def interrupted():
+        raise KeyboardInterrupt
+        yield
+
+    with pytest.raises(KeyboardInterrupt):
+        mpc.step(x + 0.3, x_ref, interrupted())
+    np.testing.assert_array_equal(mpc.step(x, x_ref).U, twin.step(x, x_ref).U)
 
 
 def test_misuse_is_refused():

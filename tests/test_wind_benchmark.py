@@ -17,6 +17,7 @@ from scp_mpc.comparison.wind_variants import (
     OTHERS,
     REPORT,
     Variant,
+    measures,
 )
 
 
@@ -37,6 +38,38 @@ def test_all_variants_meet_the_same_wind():
     np.testing.assert_allclose(*pushed, atol=1e-12)
     assert np.abs(pushed[0]).max() > 0.02
     assert np.abs(runs[0].inputs - runs[1].inputs).max() > 0.02
+
+
+def test_without_a_disturbance_rejection_is_no_worse():
+    """Long enough to pass the obstacle, for which an N of 8 is short."""
+    nominal, plain, best = (
+        measures(Variant(8, rejects, "none", thrift), 0, 100)
+        for rejects, thrift in ((False, None), (True, None), (True, BEST.thrift))
+    )
+    assert nominal["rms"] > 0.5
+    assert plain["rms"] == pytest.approx(nominal["rms"], abs=1e-6)
+    assert best["rms"] < nominal["rms"]
+    assert not any(run["slack"] or run["not_ok"] for run in (nominal, plain, best))
+
+
+def test_the_reports_way_is_the_last_plans():
+    ours, report = (Variant(30, False, sides=sides).run(0, 12) for sides in (True, False))
+    assert Variant(30, False, sides=False) == REPORT
+    assert max(len(plan.candidates) for plan in ours.plans[1:]) > 1
+    assert not any(plan.candidates for plan in report.plans)
+
+
+def test_a_row_says_how_far_it_is_from_the_reports_way():
+    variants = [Variant(8, False), Variant(8, True), Variant(8, False, sides=False)]
+    runs = [
+        {"rms": rms, "median": rms, "clearance": 0.0, "distance": 0.0}
+        | dict.fromkeys(("contact", "slack", "not_ok"), 0)
+        for rms in (1.0, 0.7, 3.0)
+    ]
+    row = wind.summary(variants[1], [runs[1]], [runs[0]], [runs[2]])
+    assert (row["excess"], row["beyond"]) == pytest.approx((-0.3, -2.3))
+    assert "beyond" not in wind.summary(variants[1], [runs[1]], [runs[0]])
+    assert "-2.300 (-2.300 to -2.300)" in markdown({"main": [row]}, 40)
 
 
 def test_measured_rows_are_kept_and_shown(tmp_path):
