@@ -246,13 +246,21 @@ def test_errors_leave_no_trace():
     np.testing.assert_array_equal(mpc.step(y, x_ref).U, aware(p).step(y, x_ref).U)
 
 
-def test_a_second_thread_is_refused_before_anything_changes():
+def test_a_second_thread_is_refused_before_anything_changes(monkeypatch):
     """It comes while the first waits inside its step, after the estimator's update."""
+    update, measured = DisturbanceEstimator.update, []
+
+    def watched_update(self, y, u=None):
+        measured.append(y[0])
+        return update(self, y, u)
+
     p = problem()
     mpc, twin = aware(p, foresight="closed loop"), aware(p, foresight="closed loop")
     x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
     for each in (mpc, twin):
         each.step(x, x_ref)
+
+    monkeypatch.setattr(DisturbanceEstimator, "update", watched_update)
 
     def waiting(pool):
         before = mpc.estimate
@@ -260,6 +268,7 @@ def test_a_second_thread_is_refused_before_anything_changes():
             with pytest.raises(ConcurrentUseError):
                 pool.submit(use).result()
         assert mpc.estimate is before
+        assert measured == [x[0] + 0.1]
         yield obstacle(8, (1.5, 0.1))
 
     with ThreadPoolExecutor(1) as pool:
