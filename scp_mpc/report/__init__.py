@@ -4,6 +4,7 @@ from scp_mpc.report.animation import write_animation
 from scp_mpc.report.canvas import save
 from scp_mpc.report.coverage_figure import coverage_figure
 from scp_mpc.report.coverage_table import coverage_numbers, coverage_table
+from scp_mpc.report.exhibits import Exhibit, exhibits
 from scp_mpc.report.figures import FIGURES, write_figures
 from scp_mpc.report.replay_animation import write_replay_animation
 from scp_mpc.report.replay_figure import replay_figure
@@ -14,9 +15,11 @@ from scp_mpc.report.table import COLUMNS, markdown_table
 __all__ = [
     "COLUMNS",
     "FIGURES",
+    "Exhibit",
     "coverage_figure",
     "coverage_numbers",
     "coverage_table",
+    "exhibits",
     "markdown_table",
     "replay_figure",
     "replay_table",

@@ -23,12 +23,20 @@ from scp_mpc.simulation.disturbance import (
     CorrelatedDisturbance,
     Disturbance,
 )
+from scp_mpc.simulation.doorway import Doorway
+from scp_mpc.simulation.drive import (
+    Drive,
+    World,
+    drive,
+)
+from scp_mpc.simulation.flight import Flight
 from scp_mpc.simulation.gust import DrydenGust
 from scp_mpc.simulation.lag import ActuatorLag
 from scp_mpc.simulation.meetings import (
     Meeting,
     find_meetings,
 )
+from scp_mpc.simulation.overtaking import Overtaking
 from scp_mpc.simulation.realisations import (
     COUPLINGS,
     applicable_couplings,
@@ -70,17 +78,23 @@ __all__ = [
     "Crossing",
     "Crowd",
     "Disturbance",
+    "Doorway",
+    "Drive",
     "DrydenGust",
+    "Flight",
     "LeadCoverage",
     "Meeting",
+    "Overtaking",
     "Pass",
     "Recording",
     "RecordingError",
     "Replay",
     "Scenario",
+    "World",
     "applicable_couplings",
     "contacts",
     "control_steps",
+    "drive",
     "find_meetings",
     "measure_coverage",
     "read_recording",

@@ -27,10 +27,10 @@ _DOOR = (2.7, 4.5)  # [m] along y
 _ROOM_TO_SPARE = 0.05  # [m] by which walls are rounded for the plans
 _PERSON = 0.25  # [m] radius
 _ROUTES: tuple[tuple[float, tuple[tuple[float, float], ...]], ...] = (
-    (1.0, ((9.5, 5.2), (7.2, 3.7), (6.1, 3.6), (4.8, 3.5), (0.8, 5.8))),
+    (1.0, ((9.4, 3.0), (7.2, 3.6), (6.1, 3.6), (4.8, 3.5), (0.8, 5.8))),
     (1.1, ((11.5, 2.2), (7.5, 3.5), (6.1, 3.6), (4.6, 3.9), (1.0, 1.2))),
-    (0.8, ((8.6, 0.4), (8.8, 6.6))),
-    (0.7, ((3.2, 6.6), (3.6, 0.4))),
+    (0.8, ((9.6, 0.4), (9.9, 6.6))),
+    (0.7, ((2.5, 6.6), (2.3, 0.4))),
     (0.6, ((10.6, 6.4), (10.2, 1.0))),
 )
 
@@ -70,7 +70,7 @@ class Doorway:
 
     @property
     def path(self) -> Path:
-        """From the lower left through the door to the upper right; it cuts the corner of the table."""
+        """From the lower left through the door to the upper right."""
         return Path.spline([[0.8, 1.4], [2.8, 2.6], [6.15, 3.6], [8.8, 4.2], [11.2, 5.6]])
 
     def problem(self) -> Problem:

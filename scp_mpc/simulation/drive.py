@@ -79,7 +79,7 @@ class Drive:
     @property
     def times(self) -> FloatArray:
         """(K+1,) [s]."""
-        return self.problem.model.dt * np.arange(len(self.states))
+        return self.problem.model.dt * np.arange(len(self.states), dtype=np.float64)
 
     @property
     def positions(self) -> FloatArray:
