@@ -40,7 +40,7 @@ class Overtaking:
         oncoming: Where the others are, and their speeds.
     """
 
-    steps: int = 65
+    steps: int = 50
     horizon: int = 25
     dt: float = 0.2
     speed: float = 14.0
