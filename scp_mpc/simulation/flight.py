@@ -45,7 +45,7 @@ class Flight:
         return Path.spline(np.stack([4 * np.cos(t), 3 * np.sin(t), height], axis=1), closed=True)
 
     def problem(self) -> Problem:
-        """Between floor and ceiling, at 5 m/s, 40 degrees and twice gravity at most."""
+        """Between floor and ceiling, at 5 m/s along each axis, 0.7 rad and 20 m/s^2 at most."""
         fast, lean = 5.0, _LEAN
         return Problem(
             Quadrotor(self.dt),

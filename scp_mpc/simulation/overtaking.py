@@ -53,7 +53,7 @@ class Overtaking:
         return KinematicBicycle(self.dt, wheelbase=2.7, rear=1.35)
 
     def problem(self) -> Problem:
-        """Between the road's edges, at 0 to 16 m/s, 4 m/s^2 and 25 degrees at most."""
+        """Between the road's edges, at 0 to 16 m/s, -5 to 2.5 m/s^2 and 0.3 rad at most."""
         return Problem(
             self.robot,
             horizon=self.horizon,
