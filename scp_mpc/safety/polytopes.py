@@ -64,7 +64,10 @@ class Polytopes:
     @classmethod
     def of(cls, predictions: Sequence[ObstaclePrediction]) -> "Polytopes | None":
         """Stack the shapes of some obstacles; None if all are round."""
-        if all(o.shape is None for o in predictions):
+        for o in predictions:  # in every control step
+            if o.shape is not None:
+                break
+        else:
             return None
         number: dict[int, int] = {}
         solids: list[Solid] = []

@@ -269,12 +269,14 @@ class CondensedSCP:
         if depths is not None:
             most, slack = float(depths.max(initial=0.0)), float(depths.sum())
             residuals = replace(residuals, feasibility=max(residuals.feasibility, most))
+        if len(point.excess):
+            most = max(most, float(point.excess.max()))
         return Descent(
             partial(self._iterate, point, cap, depths),
             point.cost,
             at.merit(point.cost, slack, point.excess),
             residuals,
-            judge(residuals, max(most, point.excess.max(initial=0.0)), self._settings.tolerance),
+            judge(residuals, most, self._settings.tolerance),
             iterations,
         )
 

@@ -110,7 +110,8 @@ class CondensedStep:
         """Clip inputs (N, nu) and sizes (M,) to their bounds and roll out; return y, and how."""
         problem, size = self.problem, self.problem.size
         inputs = problem.limited(inputs, self.data.u_last)
-        s = np.minimum(np.maximum(s, size.lower), size.upper)
+        if self.layout.moving:
+            s = np.minimum(np.maximum(s, size.lower), size.upper)
         rolled = self.condensed.rolled(inputs, guess)
         return self._outputs(rolled, s), rolled
 
