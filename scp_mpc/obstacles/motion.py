@@ -67,7 +67,7 @@ class Motion:
         if self.turn_rate and dim != 2:
             raise BoundsError("turn_rate", f"{self.turn_rate} rad/s turns in {dim} dimensions")
         phi, q, d = self.turn_rate * T, self.density, dim
-        half = sin(phi / 2) / (phi / 2) if phi else 1.0
+        half = sin(phi / 2) / (phi / 2) if phi / 2 else 1.0  # the smallest float has no half
         sigma, beta = sin(phi) / phi if phi else 1.0, half * half / 2
         gamma = (phi - sin(phi)) / phi**3 if abs(phi) > _SMALL else 1 / 6 - phi**2 / 120
         F, Q = np.zeros((2, 2 * d, 2 * d))
