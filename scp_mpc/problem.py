@@ -71,9 +71,10 @@ class Problem:
             report's `Margin`.
         inflation: "exact" for ellipsoid (+) ball, "axes" for the report's lengthened axes.
         max_obstacles: Number of obstacle slots M in the program.
-        subsamples: Points in each interval at which the obstacles are constrained where the robot's
-            way in one interval exceeds the radii; there the radii grow by as much as is needed for
-            nothing to pass between two points. 1: the samples as they are, as in the report.
+        nodes_per_interval: Points in each interval at which the obstacles are constrained where the
+            robot's way in one interval exceeds the radii; there the radii grow by as much as is
+            needed for nothing to pass between two points. 1: the samples as they are, as in the
+            report.
         slack_weight: Cost per metre of slack and stage where the constraints cannot all be met.
             The penalty is exact as long as it exceeds the obstacles' multipliers.
         x_min: Lower bounds of the states at stages 1 .. N, a number or (nx,); entries may be minus
@@ -103,7 +104,7 @@ class Problem:
     margin: Promise
     inflation: Literal["exact", "axes"]
     max_obstacles: int
-    subsamples: int
+    nodes_per_interval: int
     slack_weight: float
     x_min: FloatArray
     x_max: FloatArray
@@ -126,7 +127,7 @@ class Problem:
         margin: Promise | None = None,
         inflation: Literal["exact", "axes"] = "exact",
         max_obstacles: int = 1,
-        subsamples: int = 4,
+        nodes_per_interval: int = 4,
         slack_weight: float = 1e3,
         x_min: ArrayLike | None = None,
         x_max: ArrayLike | None = None,
@@ -152,7 +153,7 @@ class Problem:
         max_obstacles = as_count("max_obstacles", max_obstacles, least=0)
         require_positive("slack_weight", slack_weight)
         require_positive("state_slack_weight", state_slack_weight)
-        subsamples = as_count("subsamples", subsamples)
+        nodes_per_interval = as_count("nodes_per_interval", nodes_per_interval)
         if margin is None:
             margin = Margin() if model.dim == 2 else Containment(0.95)
         if not isinstance(margin, Promise):
@@ -172,7 +173,7 @@ class Problem:
             "margin": margin,
             "inflation": inflation,
             "max_obstacles": max_obstacles,
-            "subsamples": subsamples,
+            "nodes_per_interval": nodes_per_interval,
             "slack_weight": float(slack_weight),
             "x_min": lowest,
             "x_max": highest,
@@ -205,7 +206,7 @@ class Problem:
 
     def size_for(self, obstacles: int, count: int) -> float:
         """The uniform size s for so many obstacles, with `count` points in each interval."""
-        gaps = len(self.discs) if self.subsamples > 1 else 0
+        gaps = len(self.discs) if self.nodes_per_interval > 1 else 0
         return size_at(self.margin, self.model.dim, obstacles, self.horizon, count, gaps)
 
     @cached_property

@@ -91,9 +91,10 @@ class Settings:
             else, and where that has no answer, sparse programs go to OSQP first.
         acceleration: On the sparse programs, extrapolate the linearisation point; see
             `scp_mpc.solver.acceleration`.
-        sides: Where an obstacle shapes the plan, try to pass it on the other sides too.
-        sides_interval: Control steps between two such attempts while it keeps shaping the plan.
-        rivals: How many of the ways past it to follow to the end; all are ranked.
+        multi_start: Where an obstacle shapes the plan, try to pass it on the other sides too.
+        multi_start_interval: Control steps between two such attempts while it keeps shaping the
+            plan.
+        max_candidates: How many of the ways past it to follow to the end; all are ranked.
         deadline: Seconds in which a step is to end: nothing is begun that is predicted, from how
             long it took lately, to end later. None: take the time it takes.
         qp: Settings of the quadratic program's solvers.
@@ -104,9 +105,9 @@ class Settings:
     max_iterations: int = 40
     condense: bool = True
     acceleration: bool = True
-    sides: bool = True
-    sides_interval: int = 1
-    rivals: int = 1
+    multi_start: bool = True
+    multi_start_interval: int = 1
+    max_candidates: int = 1
     deadline: float | None = None
     qp: QPSettings = field(default_factory=QPSettings)
     freshness: Freshness = field(default_factory=Freshness)
@@ -115,11 +116,11 @@ class Settings:
         """Check every number."""
         require_positive("tolerance", self.tolerance)
         as_count("max_iterations", self.max_iterations)
-        as_count("sides_interval", self.sides_interval)
-        as_count("rivals", self.rivals)
+        as_count("multi_start_interval", self.multi_start_interval)
+        as_count("max_candidates", self.max_candidates)
         if self.deadline is not None:
             require_positive("deadline", self.deadline)
-        require_flags(self, "condense", "acceleration", "sides")
+        require_flags(self, "condense", "acceleration", "multi_start")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
         if not isinstance(self.freshness, Freshness):

@@ -81,7 +81,7 @@ def world(robot, seed, horizon=8, most=4):
         u_max=model.idle + half,
         robot_radius=0.15,
         max_obstacles=most,
-        subsamples=int(rng.choice([1, 4])),
+        nodes_per_interval=int(rng.choice([1, 4])),
         **changes,
     )
     return problem, rng
@@ -152,7 +152,9 @@ def complaints(problem, x0, made, plan, u_last):
 def _nearest(problem, X, U, s, obstacle, box, j):
     """Smallest distance to a no-go set, at the samples or between them, too."""
     model, N = problem.model, problem.horizon
-    share = np.arange(_FINE + 1)[:, None] / _FINE if problem.subsamples > 1 else np.ones((1, 1))
+    share = (
+        np.arange(_FINE + 1)[:, None] / _FINE if problem.nodes_per_interval > 1 else np.ones((1, 1))
+    )
     states = model.advance(X[None, :-1], U[None], share)  # (F, N, nx)
     centres = states[..., None, model.position]
     if problem.model.heading is not None:

@@ -42,7 +42,7 @@ def problem(
         "margin": Margin(lower=s_min),
         "inflation": inflation,
         "max_obstacles": max_obstacles,
-        "subsamples": 1,
+        "nodes_per_interval": 1,
     }
     return Problem(**{**values, **changes})
 

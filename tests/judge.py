@@ -217,7 +217,7 @@ def _complaints(problem, plan, X, U, s, verdict) -> list[str]:
     if plan.ok and not verdict.clear:
         said.append(f"{status}, but a constraint is violated by {worst:.3g} m")
     # What is violated between the samples does not show at them.
-    sampled = getattr(problem, "subsamples", 1) == 1
+    sampled = getattr(problem, "nodes_per_interval", 1) == 1
     rounding = verdict.allowed - TOLERANCE
     holds = not (violation + rounding > TOLERANCE).any()
     if not plan.ok and status != "STALE" and sampled and holds:

@@ -80,7 +80,7 @@ def machine_problem(name: str, horizon: int, **changes) -> Problem:
         "u_max": model.idle + room,
         "robot_radius": 0.3,
         "margin": Margin.fixed(SIZE),
-        "subsamples": 1,
+        "nodes_per_interval": 1,
     }
     if name == "bicycle":
         values |= {"x_min": [-np.inf] * 4 + [-0.8], "x_max": [np.inf] * 4 + [0.8]}

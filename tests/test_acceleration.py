@@ -64,7 +64,7 @@ def test_accelerated_and_plain_reach_the_same_optimum_the_former_sooner(inflatio
             plans = {}
             for bold in (True, False):
                 settings = Settings(
-                    sides=False, condense=False, max_iterations=300, acceleration=bold
+                    multi_start=False, condense=False, max_iterations=300, acceleration=bold
                 )
                 solver = SCP(case.problem, settings)
                 plans[bold] = solver.solve(case.x0, case.x_ref, case.obstacles, guess)

@@ -61,7 +61,7 @@ def car(model, **changes):
 
 @pytest.mark.parametrize("model", [Unicycle(DT), KinematicBicycle(DT, 1.0)])
 def test_several_discs_between_samples_without_obstacles(model):
-    problem = car(model, discs=[-0.3, 0.3], subsamples=4)
+    problem = car(model, discs=[-0.3, 0.3], nodes_per_interval=4)
     mpc, far = MPC(problem), ObstaclePrediction.still(3, [0.5, 0.1], 0.2)
     x = model.state(np.zeros(2), np.array([6.0, 0.0]))
     goal = model.state(np.array([5.0, 0.0]), np.zeros(2))
@@ -112,7 +112,7 @@ def test_the_lesser_violation_counts_states():
 def test_a_crowds_problem_keeps_the_rest():
     crowd = Crowd(8, 3)
     assert crowd.problem().max_obstacles == 3
-    assert crowd.problem().subsamples == 1
+    assert crowd.problem().nodes_per_interval == 1
 
 
 def test_copies_of_a_problem_are_as_frozen_and_plan_alike():

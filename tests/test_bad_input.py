@@ -132,8 +132,8 @@ def test_bad_margins_are_refused(values, message):
         {"tolerance": 1e-9},  # finer than what the quadratic programs deliver
         {"max_iterations": 0},
         {"max_iterations": True},
-        {"sides_interval": -2},
-        {"sides": "no"},
+        {"multi_start_interval": -2},
+        {"multi_start": "no"},
         {"acceleration": 1},
         {"qp": None},
     ],

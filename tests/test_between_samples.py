@@ -57,7 +57,7 @@ def test_nothing_tunnels_through_a_thin_fast_obstacle(x, inflation, settings):
     at_samples = SCP(problem(N, **case), settings).solve(ref[0], ref, [thin(x)])
     assert at_samples.ok
     assert gap(at_samples, thin(x)) < 0.01  # right through it
-    default = SCP(problem(N, **case, subsamples=4), settings).solve(ref[0], ref, [thin(x)])
+    default = SCP(problem(N, **case, nodes_per_interval=4), settings).solve(ref[0], ref, [thin(x)])
     assert default.status is Status.CONVERGED
     assert gap(default, thin(x)) >= 0.15
 
@@ -66,7 +66,7 @@ def test_more_points_cost_less():
     """Enlarged radii make any number of points sound; more points need less room."""
     ref = straight_reference(N, 4.0)
     costs = [
-        SCP(problem(N, robot_radius=0.1, subsamples=K)).solve(ref[0], ref, [thin(4.4)]).cost
+        SCP(problem(N, robot_radius=0.1, nodes_per_interval=K)).solve(ref[0], ref, [thin(4.4)]).cost
         for K in (2, 4, 8)
     ]
     assert costs[0] > costs[1] > costs[2] > 0
@@ -76,21 +76,21 @@ def test_more_points_cost_less():
 @given(
     seed=st.integers(0, 10_000),
     speed=st.floats(0.5, 5.0),
-    subsamples=st.sampled_from([2, 3, 4]),
+    nodes_per_interval=st.sampled_from([2, 3, 4]),
 )
-def test_plans_that_are_ok_keep_the_radii_at_all_times(seed, speed, subsamples):
+def test_plans_that_are_ok_keep_the_radii_at_all_times(seed, speed, nodes_per_interval):
     rng = np.random.default_rng(seed)
     ref = straight_reference(N, speed)
     meet, velocity = rng.uniform(0.3, 1.0) * N * DT, rng.uniform(-3, 3, 2)
     start = [speed * meet, 0.0] - meet * velocity + rng.uniform(-0.3, 0.3, 2)
     moving = obstacle(N, tuple(start), tuple(velocity), 1e-3 * np.eye(2), growth=0.0)
-    plan = SCP(problem(N, subsamples=subsamples)).solve(ref[0], ref, [moving])
+    plan = SCP(problem(N, nodes_per_interval=nodes_per_interval)).solve(ref[0], ref, [moving])
     if plan.ok:
         assert gap(plan, moving) >= 0.35
 
 
 def test_slow_robots_are_constrained_at_the_samples_alone():
-    case = problem(N, subsamples=4)
+    case = problem(N, nodes_per_interval=4)
     for speed, points in ((1.0, N), (4.0, 4 * N)):
         ref = straight_reference(N, speed)
         beside = [obstacle(N, (0.6 * speed * N * DT, 0.7))]
@@ -102,7 +102,7 @@ def test_slow_robots_are_constrained_at_the_samples_alone():
 
 
 def test_a_controller_changes_between_both_as_the_speed_changes():
-    mpc = MPC(problem(N, subsamples=4))
+    mpc = MPC(problem(N, nodes_per_interval=4))
     for speed in (1.0, 4.0, 1.0):
         ref = straight_reference(N, speed)
         plan = mpc.step(ref[0], ref, [obstacle(N, (0.6 * speed * N * DT, 0.1))])
@@ -166,7 +166,7 @@ def test_interpolated_covariances_err_on_the_safe_side(seed):
 def test_radii_leave_room_for_the_way_between_two_points():
     """The chord of a circle: two points just clear of r', and what lies between."""
     N2, rng = 2, np.random.default_rng(0)
-    case = problem(N2, subsamples=1)
+    case = problem(N2, nodes_per_interval=1)
     still = ObstaclePrediction(np.zeros((N2 + 1, 2)), np.zeros((2, 2)), 0.2)
     step = StepData.read(case, np.zeros(4), np.zeros(4), [still])
     for _ in range(200):
@@ -185,7 +185,7 @@ def test_radii_leave_room_for_the_way_between_two_points():
 def test_a_plan_that_outruns_what_was_assumed_is_not_called_safe(monkeypatch, K):
     """Assume that nothing moves between two points: the plan's own way is checked all the same."""
     monkeypatch.setattr(Sweep, "of", lambda _: Sweep(0.0, 0.0))
-    ref, case = straight_reference(N, 4.0), problem(N, robot_radius=0.1, subsamples=K)
+    ref, case = straight_reference(N, 4.0), problem(N, robot_radius=0.1, nodes_per_interval=K)
     for x in (4.4, 4.3, 4.2):
         careless = SCP(case).solve(ref[0], ref, [thin(x)])
         if careless.ok and gap(careless, thin(x)) < 0.15:
@@ -203,7 +203,7 @@ def test_a_plan_that_outruns_what_was_assumed_is_not_called_safe(monkeypatch, K)
 def test_the_risk_of_an_interval_is_shared_by_its_points():
     ref = straight_reference(N, 4.0)
     ahead = obstacle(N, (5.0, 0.2), covariance=0.04 * np.eye(2))
-    plan = SCP(problem(N, margin=StageRisk(0.05), subsamples=4)).solve(ref[0], ref, [ahead])
+    plan = SCP(problem(N, margin=StageRisk(0.05), nodes_per_interval=4)).solve(ref[0], ref, [ahead])
     assert plan.ok
     assert 0.01 <= plan.risk.stages.max() <= 0.05 * (1 + 1e-6)
 
@@ -234,7 +234,7 @@ def written_out(case, step):
 def test_certificate_and_optimum_agree_with_ipopt(seed, s_min, condense):
     rng = np.random.default_rng(seed)
     margin = Margin(2.4, s_min)
-    case = problem(N, "axes", margin=margin, subsamples=4)
+    case = problem(N, "axes", margin=margin, nodes_per_interval=4)
     ref = straight_reference(N, 4.0)
     Sigma = rotated((0.25, 0.1), rng.uniform(0, np.pi))
     ahead = obstacle(N, (5.0, rng.uniform(-0.3, 0.3)), (0.5, rng.uniform(-0.1, 0.1)), Sigma)

@@ -298,7 +298,7 @@ def test_the_merit_includes_the_price_of_the_excess():
 @paths
 def test_bounds_hold_between_obstacles_that_are_constrained_between_samples(condense):
     """At 6 m/s the robot passes through the radii in one interval."""
-    this = problem(N, subsamples=4, x_max=[INF, 6.0, 0.9, INF], du_min=-2.0, du_max=2.0)
+    this = problem(N, nodes_per_interval=4, x_max=[INF, 6.0, 0.9, INF], du_min=-2.0, du_max=2.0)
     mpc, x, last = MPC(this, Settings(condense=condense)), np.array([0, 6.0, 0, 0]), np.zeros(2)
     ways = []
     for k in range(8):

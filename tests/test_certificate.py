@@ -53,7 +53,7 @@ def residuals(case, plan):
 @pytest.mark.parametrize("kind", KINDS)
 def test_equals_an_independent_computation(monkeypatch, kind, s_min, limit):
     case = instance(kind, 12, "axes", s_min, 1)
-    solver = SCP(case.problem, Settings(sides=False, max_iterations=limit))
+    solver = SCP(case.problem, Settings(multi_start=False, max_iterations=limit))
     engine = solver._resolution.coarse
     guess = Trajectory(case.x_ref, np.zeros((12, 2)))
     monkeypatch.setattr(engine, "descend", lambda start: engine.primary.descend(start, limit))
@@ -144,7 +144,7 @@ def test_with_candidates_a_certified_plan_is_never_worse():
             case = instance(kind, 20, "exact", S_REF, seed)
             guess = Trajectory(case.x_ref, np.zeros((20, 2)))
             kept, best = (
-                SCP(case.problem, Settings(sides=sides)).solve(
+                SCP(case.problem, Settings(multi_start=sides)).solve(
                     case.x0, case.x_ref, case.obstacles, guess
                 )
                 for sides in (False, True)
@@ -159,9 +159,9 @@ def test_a_program_sent_to_the_rescue_on_purpose_gives_the_same_plan():
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
     patient = QPSettings(max_iterations=100_000, rescue=False, cold=1e9)
     ways = {
-        "daqp": Settings(sides=False),
-        "piqp": Settings(sides=False, condense=False, qp=QPSettings(cold=1e-300)),
-        "osqp": Settings(sides=False, condense=False, qp=patient),
+        "daqp": Settings(multi_start=False),
+        "piqp": Settings(multi_start=False, condense=False, qp=QPSettings(cold=1e-300)),
+        "osqp": Settings(multi_start=False, condense=False, qp=patient),
     }
     plans = {
         name: SCP(case.problem, how).solve(case.x0, case.x_ref, case.obstacles, guess)
@@ -210,7 +210,7 @@ def test_pairs_left_out_come_back_when_the_plan_moves_onto_them(monkeypatch):
     monkeypatch.setattr(condensed_scp, "_NEAR", 0.0)
     case, ref = problem(20, max_obstacles=2), straight_reference(20)
     both = [obstacle(20, (3.0, 0.15)), obstacle(20, (3.4, -1.4))]
-    solver = SCP(case, Settings(sides=False))
+    solver = SCP(case, Settings(multi_start=False))
     monkeypatch.setattr(
         solver._resolution.coarse.sparse, "descend", lambda *_: pytest.fail("no need")
     )

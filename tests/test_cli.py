@@ -52,7 +52,7 @@ def test_report_passes_its_options_on(tmp_path, monkeypatch):
     assert summary["inflation"] == "exact"
     assert summary["margin"]["lower"] == 1.5
     assert summary["seed"] == 3
-    assert summary["settings"]["sides"] is False
+    assert summary["settings"]["multi_start"] is False
 
 
 @pytest.mark.parametrize(

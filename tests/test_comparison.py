@@ -73,7 +73,7 @@ def easy(inflation="exact", dim=2, horizon=6, **changes):
         robot_radius=0.15,
         inflation=inflation,
         max_obstacles=2,
-        **{"subsamples": 1, **changes},
+        **{"nodes_per_interval": 1, **changes},
     )
     x_ref = np.zeros((horizon + 1, 2 * dim))
     x_ref[:, 0], x_ref[:, 1] = 0.4 * np.arange(horizon + 1), 2.0
@@ -87,7 +87,7 @@ def easy(inflation="exact", dim=2, horizon=6, **changes):
 
 def solved(problem, step):
     """Our plan from the plan that ignores the obstacle, and that guess."""
-    solver = SCP(problem, Settings(max_iterations=200, sides=False))
+    solver = SCP(problem, Settings(max_iterations=200, multi_start=False))
     free = solver.solve(*step[:2])
     plan = solver.solve(*step, guess=free.iterate)
     assert plan.ok

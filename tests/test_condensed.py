@@ -11,7 +11,9 @@ from scp_mpc.solver.sampling import LinearSampling
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.trajectory import rollout
 
-SPARSE = Settings(sides=False, condense=False, qp=QPSettings(accuracy=1e-9), max_iterations=300)
+SPARSE = Settings(
+    multi_start=False, condense=False, qp=QPSettings(accuracy=1e-9), max_iterations=300
+)
 
 
 def spaces():
@@ -96,7 +98,7 @@ def test_the_condensed_and_the_sparse_descent_end_in_plans_of_equal_standing(
 ):
     """From the end of one the other does not move: same plan, same forces."""
     case = instance(kind, 20, inflation, s_min, 0)
-    fast = SCP(case.problem, Settings(sides=False))
+    fast = SCP(case.problem, Settings(multi_start=False))
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
     plan = fast.solve(case.x0, case.x_ref, case.obstacles, guess)
     assert set(plan.qps) <= {"kkt", "daqp"}

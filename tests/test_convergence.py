@@ -28,7 +28,7 @@ def outcomes():
     """Solve every instance once: ours, the referee from our point, the referee from the guess."""
     rows = {}
     for case in INSTANCES:
-        solver = SCP(case.problem, Settings(sides=False, max_iterations=300))
+        solver = SCP(case.problem, Settings(multi_start=False, max_iterations=300))
         guess = Trajectory(case.x_ref, np.zeros((case.problem.horizon, 2)))
         plan = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
         referee = Referee(case.problem, case.x0, case.x_ref, case.obstacles[0])

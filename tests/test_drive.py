@@ -25,11 +25,11 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def run(name):
-    return drive(SHORT[name], Settings(sides=False))
+    return drive(SHORT[name], Settings(multi_start=False))
 
 
 def test_the_same_seed_drives_the_same_way(name, run):
-    again = drive(SHORT[name], Settings(sides=False))
+    again = drive(SHORT[name], Settings(multi_start=False))
     assert np.array_equal(again.states, run.states)
     assert np.array_equal(again.bodies[-1].means, run.bodies[-1].means)
 

@@ -183,7 +183,8 @@ def test_04_what_vanishes_is_kept_and_grows():
 
 @pytest.mark.parametrize("condense", [True, False])
 @pytest.mark.parametrize(
-    "settings", [{"max_iterations": 1}, {"deadline": 1e-6}, {"deadline": 1e-6, "sides": False}]
+    "settings",
+    [{"max_iterations": 1}, {"deadline": 1e-6}, {"deadline": 1e-6, "multi_start": False}],
 )
 def test_05_hurried_plans_say_what_they_are(settings, condense):
     """Infeasible (an obstacle on the robot, a closed way) and non-convex ones among them."""
@@ -220,7 +221,7 @@ def test_05_obstacles_far_from_the_first_plan_are_not_forgotten(iterations, side
         ObstaclePrediction(np.tile(at, (N + 1, 1)), 1e-4 * np.eye(2), radius)
         for at, radius in (([5.0, 0.1], 2.5), ([5.0, -3.6], 0.5))
     ]
-    settings = Settings(max_iterations=iterations, sides=sides)
+    settings = Settings(max_iterations=iterations, multi_start=sides)
     x0, goal = np.array([0.0, 2.0, 0.0, 0.0]), np.array([8.0, 0.0, 0.0, 0.0])
     solve_and_hold(case, x0, goal, present, settings)
 

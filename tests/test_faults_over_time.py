@@ -78,7 +78,7 @@ def test_09_memory_is_flat_over_ten_thousand_steps():
     ref = straight_reference(4)
     near, far = obstacle(4, (0.9, 0.3)), obstacle(4, (30.0, 0.0))
     worlds = [[far], [], [far, far], [near]]
-    mpc = MPC(case, Settings(sides=False))
+    mpc = MPC(case, Settings(multi_start=False))
 
     def run(steps):
         for k in range(steps):

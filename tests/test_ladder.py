@@ -114,7 +114,7 @@ def test_a_safe_plan_that_is_known_beats_slack():
     case = problem(20)
     ref = straight_reference(20, 2.0)
     wall = [obstacle(20, (4.0, 0.0), covariance=np.diag([0.01, 4.0]), growth=0.0)]
-    lazy = SCP(case, Settings(sides=False, max_iterations=1))
+    lazy = SCP(case, Settings(multi_start=False, max_iterations=1))
     onto = Trajectory(ref, np.zeros((20, 2)))
     plan = lazy.solve(ref[0], ref, wall, onto)
     assert plan.ok, plan.status

@@ -36,8 +36,8 @@ from scp_mpc.solver.active_set import ActiveSetSolver
 
 SETTINGS = {
     "plain": Settings(),
-    "one side": Settings(sides=False),
-    "sparse": Settings(condense=False, sides=False),
+    "one side": Settings(multi_start=False),
+    "sparse": Settings(condense=False, multi_start=False),
     "late": Settings(deadline=1e-6),  # so early that every step is late in the same way
     "short": Settings(max_iterations=2),
 }

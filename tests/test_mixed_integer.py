@@ -63,7 +63,7 @@ def test_no_plan_is_better_than_the_optimum(seed):
 def test_it_is_the_other_sides_that_find_it():
     """Without candidates some plans stay on the wrong side of a box."""
     steps = [world(seed) for seed in SEEDS]
-    alone = [SCP(case, Settings(sides=False)).solve(*step) for case, *step in steps]
+    alone = [SCP(case, Settings(multi_start=False)).solve(*step) for case, *step in steps]
     both = [SCP(case).solve(*step) for case, *step in steps]
     worse = [a.cost > b.cost * 1.01 or not a.ok for a, b in zip(alone, both, strict=True)]
     assert np.mean(worse) >= 0.25

@@ -201,7 +201,7 @@ def test_sides_are_tried_at_first_contact_and_then_at_intervals():
     """Trailing exactly behind a slow obstacle keeps it in touch with every plan."""
     case = problem(20)
     for interval in (1, 3):
-        mpc, tried = MPC(case, Settings(sides_interval=interval)), []
+        mpc, tried = MPC(case, Settings(multi_start_interval=interval)), []
         for _ in range(2):
             x = np.array([0.0, 2.0, 0.3, 0.0])
             for k in range(7):

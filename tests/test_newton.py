@@ -109,7 +109,7 @@ def test_summed_and_plain_reach_the_same_optimum_the_former_sooner(monkeypatch, 
     cases = [
         instance(kind, 20, inflation, S_REF, s) for kind, s in itertools.product(KINDS, (0, 1))
     ]
-    settings = Settings(sides=False, max_iterations=2000)
+    settings = Settings(multi_start=False, max_iterations=2000)
 
     def solve(case):
         guess = Trajectory(case.x_ref, np.zeros((20, 2)))
@@ -126,13 +126,13 @@ def test_summed_and_plain_reach_the_same_optimum_the_former_sooner(monkeypatch, 
 
 def exact(limit):
     qp = QPSettings(accuracy=1e-12)
-    return Settings(sides=False, tolerance=1e-12, max_iterations=limit, qp=qp)
+    return Settings(multi_start=False, tolerance=1e-12, max_iterations=limit, qp=qp)
 
 
 def test_convergence_is_quadratic_at_the_end():
     """From near the optimum, each residual is about the square of the one before."""
     case = instance("ahead", 20, "exact", S_REF, 0)
-    tight = Settings(sides=False, tolerance=1e-7)
+    tight = Settings(multi_start=False, tolerance=1e-7)
     plan = SCP(case.problem, tight).solve(case.x0, case.x_ref, case.obstacles)
     rng = np.random.default_rng(0)
     X = plan.X.copy()
@@ -160,7 +160,7 @@ def head_on():
 
 def test_leaps_leave_a_saddle_sooner(monkeypatch):
     case, ref, slow, guess = head_on()
-    settings = Settings(sides=False, max_iterations=500)
+    settings = Settings(multi_start=False, max_iterations=500)
     quick = SCP(case, settings).solve(ref[0], ref, slow, guess)
     plain(monkeypatch)
     creeping = SCP(case, settings).solve(ref[0], ref, slow, guess)
@@ -173,7 +173,7 @@ def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
     """Leap a metre aside after every convex step: the plan must be as good as without."""
     case = instance("ahead", 20, "exact", S_REF, 0)
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
-    settings = Settings(sides=False, max_iterations=2000)
+    settings = Settings(multi_start=False, max_iterations=2000)
     plain(monkeypatch)
     expected = SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
     leapt = []
@@ -198,7 +198,7 @@ def test_a_spatial_plan_converges_as_quickly():
     ref[:, 0], ref[:, 1] = 0.4 * np.arange(16), 2.0
     Sigma = np.diag([0.04, 0.01, 0.02])
     ball = ObstaclePrediction(np.tile([3.0, 0.05, 0.1], (16, 1)), Sigma, 0.2)
-    plan = SCP(case, Settings(sides=False)).solve(ref[0], ref, [ball])
+    plan = SCP(case, Settings(multi_start=False)).solve(ref[0], ref, [ball])
     assert plan.status is Status.CONVERGED
     assert plan.iterate.touches
     assert plan.iterations <= 15

@@ -37,7 +37,7 @@ def outcome(name, kind, horizon, seed):
     case = ride(name, kind, horizon, seed)
     problem = case.problem
     guess = Trajectory(case.x_ref, np.tile(problem.model.idle, (horizon, 1)))
-    solver = SCP(problem, Settings(sides=False, max_iterations=300))
+    solver = SCP(problem, Settings(multi_start=False, max_iterations=300))
     plan = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
     referee = ModelReferee(
         problem,

@@ -46,9 +46,9 @@ def depths(plan, problem, obstacle, fine=20):
     return np.array(gaps) - obstacle.radius - problem.robot_radius
 
 
-@pytest.mark.parametrize("subsamples", [1, 4])
+@pytest.mark.parametrize("nodes_per_interval", [1, 4])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_function_that_is_linear_gives_the_linear_plan(seed, subsamples, monkeypatch):
+def test_a_function_that_is_linear_gives_the_linear_plan(seed, nodes_per_interval, monkeypatch):
     # What bends between two points is measured in other ways for a linear robot.
     for measured in ("assumed", "sweep"):
         monkeypatch.setattr(engine.Engine, measured, lambda *_: Sweep(0.35, 0.01))
@@ -66,7 +66,7 @@ def test_a_function_that_is_linear_gives_the_linear_plan(seed, subsamples, monke
         return np.stack([x[..., 1], u[..., 0], x[..., 3], u[..., 1]], axis=-1)
 
     same = {"nx": 4, "nu": 2, "dt": DT, "position": linear.position, "vectorised": True}
-    if subsamples == 1:
+    if nodes_per_interval == 1:
         twin = FunctionModel(function, jacobians, discrete=True, **same)
     else:
         twin = FunctionModel(acceleration, "complex", **same)
@@ -82,14 +82,14 @@ def test_a_function_that_is_linear_gives_the_linear_plan(seed, subsamples, monke
         "x_max": [np.inf, 1.7, np.inf, 0.6],
         "robot_radius": 0.3,
         "margin": Margin.fixed(2.0),
-        "subsamples": subsamples,
+        "nodes_per_interval": nodes_per_interval,
     }
     x_ref = np.zeros((N + 1, 4))
     x_ref[:, 0], x_ref[:, 1] = 1.8 * DT * np.arange(N + 1), 1.8
     x0 = np.array([0.0, 1.5, 0.0, 0.0]) + 0.05 * rng.normal(size=4)
     obstacle = ahead((1.6, 0.2 + 0.1 * rng.uniform()))
     given = x0, x_ref, [obstacle]
-    settings = Settings(sides=False, tolerance=1e-7, max_iterations=200)
+    settings = Settings(multi_start=False, tolerance=1e-7, max_iterations=200)
     ours, other = (
         SCP(Problem(model, **values), settings).solve(*given, u_last=np.zeros(2))
         for model in (twin, linear)
@@ -116,7 +116,7 @@ def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
     problem = machine_problem("quadrotor", 20)
     x0, x_ref = np.zeros(9), straight(problem.model, 20)
     x0[[1, 8]] = -1.5, -2.8
-    plan = SCP(problem, Settings(sides=False, max_iterations=300)).solve(x0, x_ref)
+    plan = SCP(problem, Settings(multi_start=False, max_iterations=300)).solve(x0, x_ref)
     assert plan.status is Status.CONVERGED
     finite = np.array([radius for radius in radii if np.isfinite(radius)])
     assert len(finite)
@@ -130,7 +130,7 @@ def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
 @pytest.mark.parametrize("name", ["unicycle", "bicycle"])
 @pytest.mark.parametrize("turned", [np.pi, 2.0, -2.5])
 def test_a_start_far_away_is_survived(name, turned):
-    problem = machine_problem(name, N, subsamples=4)
+    problem = machine_problem(name, N, nodes_per_interval=4)
     x_ref = straight(problem.model, N)
     x0 = np.zeros(problem.model.nx)
     x0[1:3] = 0.2, turned
@@ -166,7 +166,7 @@ def test_a_start_outside_the_speed_bound_reports_the_excess():
 @pytest.mark.parametrize("name", ["unicycle", "bicycle"])
 def test_closed_loop_of_a_long_robot_keeps_rates_bounds_and_distance(name):
     discs = (-0.3, 0.2, 0.7)
-    problem = machine_problem(name, N, subsamples=4, discs=discs, du_min=-0.6, du_max=0.6)
+    problem = machine_problem(name, N, nodes_per_interval=4, discs=discs, du_min=-0.6, du_max=0.6)
     model, controller = problem.model, MPC(problem)
     x, last, obstacle = straight(model, 1)[0], model.idle, ahead((2.5, 0.15))
     for k in range(16):
@@ -185,7 +185,7 @@ def test_closed_loop_of_a_long_robot_keeps_rates_bounds_and_distance(name):
 
 @pytest.mark.parametrize("deadline", [1e-5, 2e-3, 2e-2])
 def test_deadlines_end_with_a_sound_status(deadline):
-    problem = machine_problem("unicycle", 20, subsamples=4)
+    problem = machine_problem("unicycle", 20, nodes_per_interval=4)
     controller, x = MPC(problem, Settings(deadline=deadline)), straight(problem.model, 1)[0]
     obstacle = ahead((1.6, 0.1), horizon=20)
     for k in range(6):
@@ -213,7 +213,7 @@ def test_reset_gives_the_same_bits():
 
 @pytest.mark.parametrize("margin", [JointRisk(0.05), StageRisk(0.01)])
 def test_promises_of_risk_are_kept(margin):
-    problem = machine_problem("unicycle", N, margin=margin, subsamples=4)
+    problem = machine_problem("unicycle", N, margin=margin, nodes_per_interval=4)
     x_ref = straight(problem.model, N)
     plan = SCP(problem).solve(x_ref[0], x_ref, [ahead()])
     assert plan.status is Status.CONVERGED
@@ -266,7 +266,7 @@ def test_misuse_is_refused():
 
 
 def test_braking_from_any_heading_stays_clear():
-    problem = machine_problem("unicycle", N, subsamples=4)
+    problem = machine_problem("unicycle", N, nodes_per_interval=4)
     solver, obstacle = SCP(problem), ahead((2.0, 0.0))
     x_ref = straight(problem.model, N)
     plan = solver.brake(x_ref[0], x_ref)

@@ -15,7 +15,7 @@ from scp_mpc import (
     Status,
 )
 
-SETTINGS = Settings(sides=False, max_iterations=100)
+SETTINGS = Settings(multi_start=False, max_iterations=100)
 
 
 def as_function(model):
@@ -67,11 +67,13 @@ def drive(mpc, x, reference, predictions, steps):
 
 
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("subsamples", [1, 4])
-def test_closed_loops_pass_the_obstacle_and_keep_rates(name, subsamples):
-    case = machine_problem(name, 15, subsamples=subsamples)
+@pytest.mark.parametrize("nodes_per_interval", [1, 4])
+def test_closed_loops_pass_the_obstacle_and_keep_rates(name, nodes_per_interval):
+    case = machine_problem(name, 15, nodes_per_interval=nodes_per_interval)
     room = 0.25 * (case.u_max - case.u_min)
-    case = machine_problem(name, 15, subsamples=subsamples, du_min=-room, du_max=room)
+    case = machine_problem(
+        name, 15, nodes_per_interval=nodes_per_interval, du_min=-room, du_max=room
+    )
     model, shift = case.model, np.zeros(case.model.nx)
     shift[model.position[0]] = 1.5 * model.dt
     ref, at = straight(model, 15), np.zeros(model.dim)
@@ -93,7 +95,7 @@ def test_closed_loops_pass_the_obstacle_and_keep_rates(name, subsamples):
 
 def test_no_good_plan_is_forgotten_for_a_clear_one():
     """A bicycle that is pushed off its line finds back; plans' costs fall all the way."""
-    case = machine_problem("bicycle", 20, subsamples=1)
+    case = machine_problem("bicycle", 20, nodes_per_interval=1)
     model, ref = case.model, straight(case.model, 20, speed=3.0)
     shift = np.array([3.0 * model.dt, 0, 0, 0, 0])
     there = ObstaclePrediction(np.tile([4.0, 0.2], (21, 1)), 0.01 * np.eye(2), 0.3)
@@ -107,7 +109,7 @@ def test_no_good_plan_is_forgotten_for_a_clear_one():
 
 @pytest.mark.parametrize("discs", [[-0.4, 0.4], [0.0, 0.5, 1.0]])
 def test_discs_keep_out_with_all_of_them(discs):
-    case = machine_problem("bicycle", 20, subsamples=4, discs=discs)
+    case = machine_problem("bicycle", 20, nodes_per_interval=4, discs=discs)
     model, ref = case.model, straight(case.model, 20)
     there = ObstaclePrediction(np.tile([3.0, 0.1], (21, 1)), np.zeros((2, 2)), 0.25)
     plan = SCP(case).solve(ref[0], ref, [there])

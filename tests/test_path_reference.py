@@ -167,7 +167,7 @@ def test_the_robot_follows_a_path_round_obstacles_and_stops():
     """In closed loop: on the path where it is free, round what stands on it, to its end."""
     path = Path.spline([[0, 0], [4, 1.5], [8, -1.5], [12, 0], [14, 3]])
     horizon = 15
-    task = problem(horizon, max_obstacles=2, u_min=-3.0, u_max=3.0, subsamples=4)
+    task = problem(horizon, max_obstacles=2, u_min=-3.0, u_max=3.0, nodes_per_interval=4)
     reference = PathReference(path, speed=LIMITS, model=task.model, horizon=horizon)
     places = path.positions([5.0, 11.0]) + [[0.1, 0.2], [-0.1, 0.15]]
     obstacles = [

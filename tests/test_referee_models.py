@@ -72,7 +72,7 @@ def test_it_judges_in_space():
         u_max=3.0,
         robot_radius=0.15,
         margin=Containment(0.95),
-        subsamples=1,
+        nodes_per_interval=1,
     )
     way = np.stack([2 * DT * np.arange(N + 1), np.zeros(N + 1), np.zeros(N + 1)], axis=-1)
     x_ref = model.state(way, np.broadcast_to([2.0, 0.0, 0.0], way.shape))

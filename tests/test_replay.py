@@ -84,7 +84,7 @@ def test_somebody_fast_is_touched_between_samples():
     recording = Recording.from_rows(times, np.zeros(len(times), np.intp), places)
     still = Problem(
         DoubleIntegrator(0.2), horizon=5, Q=[1, 1, 1, 1], R=[1, 1], u_min=0, u_max=0,
-        robot_radius=0.1, max_obstacles=1, subsamples=1,
+        robot_radius=0.1, max_obstacles=1, nodes_per_interval=1,
     )  # fmt: skip
     run = replay(recording, Crossing([0, 0], [0, 0.2]), still, radius=0.1)
     (meeting,) = find_meetings(run)

@@ -81,7 +81,7 @@ def test_the_bound_without_doubt_and_within_the_disc():
 
 def test_promises_become_sizes():
     def size(margin, obstacles=2, **changes):
-        values = {"max_obstacles": 3, "subsamples": 4, **changes}
+        values = {"max_obstacles": 3, "nodes_per_interval": 4, **changes}
         return problem(10, margin=margin, **values).size_for(obstacles, 4)
 
     assert size(StageRisk(0.05)) == pytest.approx(norm.isf(0.05 / 5))
@@ -104,8 +104,8 @@ def test_promises_become_sizes():
         lambda: JointRisk(0.1, "fair"),
         lambda: Containment(1.0),
         lambda: problem(5, margin=0.05),
-        lambda: problem(5, subsamples=0),
-        lambda: problem(5, subsamples=2.0),
+        lambda: problem(5, nodes_per_interval=0),
+        lambda: problem(5, nodes_per_interval=2.0),
     ],
 )
 def test_bad_promises_are_refused(make):
@@ -122,22 +122,24 @@ CROSSING = {"position": (3.2, -1.6), "velocity": (0.0, 0.8), "covariance": 0.03 
 AHEAD = {"position": (2.6, 0.1), "velocity": (0.4, 0.0), "covariance": rotated((0.3, 0.1), 0.6)}
 
 
-def solved(margin, subsamples=1, **changes):
+def solved(margin, nodes_per_interval=1, **changes):
     N, ref = 15, straight_reference(15)
     both = [obstacle(N, **CROSSING), obstacle(N, **AHEAD)]
-    case = problem(N, margin=margin, max_obstacles=3, subsamples=subsamples, **changes)
+    case = problem(
+        N, margin=margin, max_obstacles=3, nodes_per_interval=nodes_per_interval, **changes
+    )
     return SCP(case).solve(ref[0], ref, both)
 
 
-@pytest.mark.parametrize("subsamples", [1, 4])
+@pytest.mark.parametrize("nodes_per_interval", [1, 4])
 @pytest.mark.parametrize("delta", [0.1, 0.01])
-def test_plans_commit_to_no_more_than_promised(delta, subsamples):
-    stage = solved(StageRisk(delta), subsamples)
+def test_plans_commit_to_no_more_than_promised(delta, nodes_per_interval):
+    stage = solved(StageRisk(delta), nodes_per_interval)
     assert stage.ok
     assert stage.risk.stages.shape == (2, 15)
     assert stage.risk.stages.max() <= delta * (1 + 1e-5)
-    uniform = solved(JointRisk(delta), subsamples)
-    iterative = solved(JointRisk(delta, "iterative"), subsamples)
+    uniform = solved(JointRisk(delta), nodes_per_interval)
+    iterative = solved(JointRisk(delta, "iterative"), nodes_per_interval)
     for plan in (uniform, iterative):
         assert plan.ok
         assert plan.risk.joint <= delta * (1 + 1e-5)

@@ -22,7 +22,7 @@ from scp_mpc.solver.descent import Descent, judge
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.trusted import TrustedSolver
 
-KEEP_SIDE = Settings(sides=False)
+KEEP_SIDE = Settings(multi_start=False)
 
 
 def test_no_obstacle_equals_the_riccati_solution():
@@ -80,7 +80,9 @@ def test_exact_iterates_stay_feasible_and_costs_never_rise(kind):
     """The convex-concave argument: sound half-spaces, tight at the nominal point."""
     case = instance(kind, 20, "exact", 0.5, 0)
     for limit in (1, 2, 4):
-        solver = SCP(case.problem, Settings(sides=False, max_iterations=limit, tolerance=1e-7))
+        solver = SCP(
+            case.problem, Settings(multi_start=False, max_iterations=limit, tolerance=1e-7)
+        )
         guess = Trajectory(case.x_ref, np.zeros((20, 2)))
         costs = []
         for _ in range(6):
@@ -122,7 +124,7 @@ def test_warm_start_cuts_qp_iterations(monkeypatch):
     monkeypatch.setattr(TrustedSolver, "_residuals", counting)
     case = instance("beside", 30, "exact", S_REF, 0)
     settings = Settings(
-        sides=False, condense=False, qp=QPSettings(max_iterations=20000, rescue=False)
+        multi_start=False, condense=False, qp=QPSettings(max_iterations=20000, rescue=False)
     )
     solver = SCP(case.problem, settings)
     plan = solver.solve(case.x0, case.x_ref, case.obstacles)
@@ -140,7 +142,7 @@ def test_more_tolerance_takes_fewer_programs():
     case = instance("ahead", 30, "exact", S_REF, 0)
     counts = []
     for tolerance in (1e-3, 1e-6):
-        solver = SCP(case.problem, Settings(sides=False, tolerance=tolerance))
+        solver = SCP(case.problem, Settings(multi_start=False, tolerance=tolerance))
         plan = solver.solve(case.x0, case.x_ref, case.obstacles)
         assert plan.kkt.worst <= tolerance
         counts.append(plan.iterations)
@@ -176,7 +178,7 @@ def test_slack_is_exactly_zero_where_a_plan_exists():
 
 def test_running_out_of_iterations_is_said_so():
     case = instance("ahead", 30, "exact", S_REF, 0)
-    hurried = SCP(case.problem, Settings(sides=False, max_iterations=1))
+    hurried = SCP(case.problem, Settings(multi_start=False, max_iterations=1))
     plan = hurried.solve(case.x0, case.x_ref, case.obstacles)
     assert plan.status is Status.FEASIBLE
     assert plan.ok
@@ -312,7 +314,7 @@ def test_a_rival_must_lead_and_safety_comes_first():
 def test_an_extrapolation_that_costs_more_is_taken_back(monkeypatch):
     """A proposal a metre off the mark: the plan must be as good as without any."""
     case = instance("ahead", 20, "exact", S_REF, 0)
-    settings = Settings(sides=False, condense=False, acceleration=False, max_iterations=300)
+    settings = Settings(multi_start=False, condense=False, acceleration=False, max_iterations=300)
     plain = SCP(case.problem, settings)
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
     expected = plain.solve(case.x0, case.x_ref, case.obstacles, guess)
@@ -331,7 +333,7 @@ def test_an_extrapolation_that_costs_more_is_taken_back(monkeypatch):
 
     monkeypatch.setattr(Anderson, "propose", astray)
     monkeypatch.setattr(Anderson, "reject", counting)
-    bold = SCP(case.problem, Settings(sides=False, condense=False, max_iterations=300))
+    bold = SCP(case.problem, Settings(multi_start=False, condense=False, max_iterations=300))
     plan = bold.solve(case.x0, case.x_ref, case.obstacles, guess)
     assert rejected
     assert plan.status is Status.CONVERGED

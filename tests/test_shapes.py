@@ -198,7 +198,7 @@ WORLDS = {
 @both
 def test_plans_are_certified_and_clear_between_the_samples(inflation, world):
     kind = "exact" if inflation is INFLATIONS["exact"] else "axes"
-    case = problem(HORIZON, kind, max_obstacles=2, subsamples=4)
+    case = problem(HORIZON, kind, max_obstacles=2, nodes_per_interval=4)
     plan = certified(case, REF[0], REF, WORLDS[world])
     assert -1e-6 < clearance(case, plan, WORLDS[world]) < 0.1
     assert plan.risk.joint == 0.0
@@ -228,7 +228,7 @@ def test_a_corridor_with_somebody_in_it():
     side = Polytope.box([12.0, 0.2])
     walls = [side.still(HORIZON, (4.0, y)) for y in (-1.3, 1.3)]
     person = obstacle(HORIZON, (6.0, 0.35), (-1.0, 0.0), 0.01 * np.eye(2))
-    case = problem(HORIZON, max_obstacles=3, subsamples=4)
+    case = problem(HORIZON, max_obstacles=3, nodes_per_interval=4)
     plan = certified(case, REF[0], REF, [*walls, person])
     assert clearance(case, plan, walls) > -1e-6
     apart = plan.X[1:, [0, 2]] - person.means[1:]
@@ -244,7 +244,7 @@ def test_a_polyhedron_in_space():
         Q=[0.2, 0.05] * dim,
         R=[0.001] * dim,
         margin=None,
-        subsamples=4,
+        nodes_per_interval=4,
     )
     ref = np.pad(REF, ((0, 0), (0, 2)))
     points = np.random.default_rng(2).normal(size=(12, 3))
@@ -284,7 +284,7 @@ def test_the_robots_own_uncertainty_keeps_it_off_the_wall():
 
 def test_a_robot_drives_through_doors():
     """In closed loop, with the last plan as a guess, without touching."""
-    case = problem(HORIZON, max_obstacles=3, subsamples=4)
+    case = problem(HORIZON, max_obstacles=3, nodes_per_interval=4)
     walls = [*WORLDS["door"], WALL.still(HORIZON, (7.5, 0.8), name="third")]
     mpc, x = MPC(case), REF[0].copy()
     for k in range(12):

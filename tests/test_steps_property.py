@@ -12,8 +12,8 @@ from scp_mpc import SCP, Settings
 
 KINDS = [
     Settings(),
-    Settings(sides=False, max_iterations=1),
-    Settings(condense=False, sides=False),
+    Settings(multi_start=False, max_iterations=1),
+    Settings(condense=False, multi_start=False),
     Settings(condense=False, max_iterations=1),
     Settings(deadline=1e-6),
     Settings(condense=False, deadline=1e-6),

@@ -243,7 +243,7 @@ def test_bad_settings_are_refused(changes, error):
 def test_the_controller_takes_the_predictions():
     problem = Problem(
         DoubleIntegrator(0.2), horizon=10, Q=[1, 0.1, 1, 0.1], R=[0.1, 0.1], u_min=-3, u_max=3,
-        robot_radius=0.3, max_obstacles=3, subsamples=1,
+        robot_radius=0.3, max_obstacles=3, nodes_per_interval=1,
     )  # fmt: skip
     mpc = MPC(problem, Settings(freshness=Freshness(stamps="required", keep=0)))
     follower = tracker()

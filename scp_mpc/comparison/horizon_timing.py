@@ -157,11 +157,11 @@ def _peers(problem: Problem) -> dict[str, Peer | None]:
     """The solvers by name; None for one that is not installed, whose row is kept."""
 
     def sparse(qp: QPSettings) -> Peer:
-        return Ours(problem, Settings(sides=False, condense=False, qp=qp))
+        return Ours(problem, Settings(multi_start=False, condense=False, qp=qp))
 
     peers: dict[str, Peer | None] = {}
     builders: dict[str, Callable[[], Peer]] = {
-        "scp_mpc": lambda: Ours(problem, Settings(sides=False)),
+        "scp_mpc": lambda: Ours(problem, Settings(multi_start=False)),
         "scp_mpc (both sides)": lambda: Ours(problem, challenge=True),
         "scp_mpc (osqp)": lambda: sparse(QPSettings()),
         "scp_mpc (osqp alone)": lambda: sparse(QPSettings(rescue=False, max_iterations=4000)),

@@ -50,9 +50,10 @@ class Unknowns:
 
     def __init__(self, problem: Problem) -> None:
         """Lay out z and its bounds."""
-        if problem.subsamples > 1:
+        if problem.nodes_per_interval > 1:
             raise InvalidArgumentError(
-                "problem.subsamples", f"{problem.subsamples}, but peers constrain the samples only"
+                "problem.nodes_per_interval",
+                f"{problem.nodes_per_interval}, but peers constrain the samples only",
             )
         refuse_limits(problem)
         N, nx, nu = problem.horizon, problem.model.nx, problem.model.nu

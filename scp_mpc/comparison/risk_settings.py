@@ -117,7 +117,7 @@ def problem_for(
         "max_obstacles": obstacles,
     }
     if setting.kind in _AT_SAMPLES:
-        values["subsamples"] = 1
+        values["nodes_per_interval"] = 1
     return Problem(model, **(values | given))
 
 

@@ -34,14 +34,14 @@ class Course:
 
     name: str
     world: Scenario | Crowd | Circuit
-    subsamples: int = 1
+    nodes_per_interval: int = 1
 
     @property
     def problem(self) -> Problem:
         """What is solved; circuits have the library's points between the samples."""
         if isinstance(self.world, Circuit):
             return self.world.problem
-        return self.world.problem("exact", subsamples=self.subsamples)
+        return self.world.problem("exact", nodes_per_interval=self.nodes_per_interval)
 
     def clearance(self, step: int, path: FloatArray) -> float:
         """Smallest true distance [m] along one interval; path (T, d) at equal fractions of it."""
@@ -109,7 +109,7 @@ def _row(course: Course, sides: bool, steps: int, advance: Callable[[], object])
         world.states(k),
         world.predictions(k),
     )
-    settings = Settings(sides=sides)
+    settings = Settings(multi_start=sides)
     MPC(problem, settings).step(x, *given(0))
     mpc, plans, wall, thread, gaps = MPC(problem, settings), [], [], [], []
     gc.collect()
@@ -135,7 +135,7 @@ def _row(course: Course, sides: bool, steps: int, advance: Callable[[], object])
         "robot": course.name,
         "horizon": problem.horizon,
         "obstacles": problem.max_obstacles,
-        "points": problem.subsamples,
+        "points": problem.nodes_per_interval,
         "sides": sides,
         "steps": steps,
         "wall": _summary(wall),

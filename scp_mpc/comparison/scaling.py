@@ -97,7 +97,7 @@ def _drive(
     """A closed loop without disturbance; one step solved before the clock runs."""
     problem = world.problem("axes")
     MPC(problem).step(world.start(), world.states(0), world.predictions(0))
-    mpc, x = MPC(problem, Settings(sides=sides)), world.start()
+    mpc, x = MPC(problem, Settings(multi_start=sides)), world.start()
     gc.collect()
     for k in range(steps):
         x_ref, obstacles = world.states(k), world.predictions(k)

@@ -100,7 +100,7 @@ class Variant:
         if not self.obstacle:
             scenario = replace(scenario, obstacle=replace(scenario.obstacle, track_radius=_FAR))
         problem = scenario.problem("exact" if self.inflation == "exact" else "axes")
-        settings = Settings(sides=self.sides)
+        settings = Settings(multi_start=self.sides)
         return simulate(
             scenario, problem, settings, steps=steps, seed=seed, controller=self._controller
         )

@@ -161,7 +161,7 @@ class MPC:
         last: FloatArray | None,
     ) -> Plan:
         if recall.stale is None:
-            challenge = self._steps_touching % self.settings.sides_interval == 0
+            challenge = self._steps_touching % self.settings.multi_start_interval == 0
             shifted = None if self._last is None else self._shifted
             return self._solver.solve_from(
                 x0, x_ref, recall.obstacles, shifted, challenge, robot_covariance, watch, last

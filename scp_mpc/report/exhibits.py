@@ -83,7 +83,7 @@ def exhibits() -> dict[str, Exhibit]:
         Exhibit(
             "overtaking",
             Overtaking(),
-            Settings(sides_interval=2),
+            Settings(multi_start_interval=2),
             road_view,
             _road_traces,
             (5, 15, 20, 24, 28, 36),
@@ -93,7 +93,7 @@ def exhibits() -> dict[str, Exhibit]:
         Exhibit(
             "flight",
             Flight(),
-            Settings(sides_interval=4),
+            Settings(multi_start_interval=4),
             space_view,
             _flight_traces,
             (10, 45, 80),
@@ -104,7 +104,7 @@ def exhibits() -> dict[str, Exhibit]:
         Exhibit(
             "doorway",
             Doorway(),
-            Settings(sides_interval=4),
+            Settings(multi_start_interval=4),
             partial(room_view, walls=len(Doorway().walls), room=ROOM),
             _doorway_traces,
             (15, 35, 60),

@@ -53,10 +53,12 @@ class Crowd:
         self,
         inflation: Literal["exact", "axes"] = "exact",
         margin: Promise | None = None,
-        subsamples: int = 1,
+        nodes_per_interval: int = 1,
     ) -> Problem:
         """The report's problem with room for all obstacles."""
-        single = Scenario(self.name, self.name, self.horizon).problem(inflation, margin, subsamples)
+        single = Scenario(self.name, self.name, self.horizon).problem(
+            inflation, margin, nodes_per_interval
+        )
         return replace(single, max_obstacles=self.count)
 
     def start(self) -> FloatArray:

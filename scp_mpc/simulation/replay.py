@@ -127,7 +127,7 @@ def replay_problem(
         robot_radius=0.3,
         margin=Containment(0.95) if margin is None else margin,
         max_obstacles=max_obstacles,
-        subsamples=1,
+        nodes_per_interval=1,
     )
 
 

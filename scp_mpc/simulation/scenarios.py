@@ -45,7 +45,7 @@ class Scenario:
         self,
         inflation: Literal["exact", "axes"] = "axes",
         margin: Promise | None = None,
-        subsamples: int = 1,
+        nodes_per_interval: int = 1,
     ) -> Problem:
         """The report's problem (III.A, III.E), with s_min = s_ref and samples only, as printed."""
         return Problem(
@@ -59,7 +59,7 @@ class Scenario:
             margin=margin,
             inflation=inflation,
             max_obstacles=1,
-            subsamples=subsamples,
+            nodes_per_interval=nodes_per_interval,
         )
 
     def start(self) -> FloatArray:

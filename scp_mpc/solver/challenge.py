@@ -59,7 +59,7 @@ class Challenge:
         Not where no program was solved: there is no time, or no solver. Nor where no obstacle has
         to do with what is wrong, as with a start outside the states' bounds.
         """
-        if not self._settings.sides or best.iterate.multipliers is None:
+        if not self._settings.multi_start or best.iterate.multipliers is None:
             return False
         clear = float(best.iterate.slack.max(initial=0.0)) <= self._settings.tolerance
         return not clear or ((due or not best.status.ok) and best.iterate.touches)
@@ -94,7 +94,7 @@ class Challenge:
             Candidate(side.obstacle, side.normal, side.time, start.merit)
             for side, start in zip(sides, starts, strict=False)  # fewer where time ran out
         )
-        rivals = self._settings.rivals
+        rivals = self._settings.max_candidates
         if thorough:
             starts = self._searched(engine, step, watch, present, starts)
             rivals += _BEAM - 1  # some lead to where we are

@@ -21,7 +21,7 @@ class PlanRisk:
 
     They hold for the Gaussians that were predicted, with Boole's inequality over points, stages
     and obstacles, whatever the correlation between them, and for a robot that is clear now. With
-    `subsamples=1` they are about the samples only.
+    `nodes_per_interval=1` they are about the samples only.
 
     Attributes:
         stages: (J, N) of touching obstacle j between samples i - 1 and i, which takes one of the
@@ -52,6 +52,6 @@ def plan_risk(step: StepData, iterate: Iterate) -> PlanRisk:
     points = step.sampling.stages(point_risks(step, path))
     whole = points.sum(axis=(1, 2))
     stages = points.sum(axis=2)
-    if step.problem.subsamples > 1:
+    if step.problem.nodes_per_interval > 1:
         stages[:, 1:] += points[:, :-1, -step.sampling.discs :].sum(axis=2)
     return PlanRisk(np.minimum(stages, 1.0), np.minimum(whole, 1.0), min(1.0, float(whole.sum())))

@@ -25,8 +25,8 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
         guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N * len(problem.discs))))
     path = {"states": (N + 1, model.nx), "inputs": (N, model.nu)}
     coarse = N * len(problem.discs)
-    fine = guess.slack.shape == (M, coarse * problem.subsamples)
-    points = coarse * problem.subsamples if fine else coarse
+    fine = guess.slack.shape == (M, coarse * problem.nodes_per_interval)
+    points = coarse * problem.nodes_per_interval if fine else coarse
     _check(guess, {**path, "s": (M,), "slack": (M, points)})
     if guess.multipliers is not None:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}

@@ -37,9 +37,9 @@ class Resolution:
         """Set both engines up."""
         self.coarse = self.fine = Engine(problem, settings, 1)
         self._tolerance = settings.tolerance
-        self._covers_gaps = problem.subsamples > 1
+        self._covers_gaps = problem.nodes_per_interval > 1
         if self._covers_gaps:
-            self.fine = Engine(problem, settings, problem.subsamples)
+            self.fine = Engine(problem, settings, problem.nodes_per_interval)
 
     @property
     def wants_nominal(self) -> bool:

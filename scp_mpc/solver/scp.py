@@ -83,7 +83,8 @@ class SCP:
             x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
             obstacles: At most `max_obstacles` predictions over the same horizon.
             guess: Where to linearise first; None for the plan that ignores the obstacles.
-            challenge: Try the other sides even if this one works, unless `settings.sides` is off.
+            challenge: Try the other sides even if this one works, unless `settings.multi_start` is
+                off.
             robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2]; adds to the
                 obstacles'.
             u_last: (nu,) input last applied, from which the first rate counts. None for unknown:
