@@ -1,6 +1,6 @@
 """Exceptions for misuse.
 
-Outcomes of a solve are statuses (`scp_mpc.solver.plan.Status`), never exceptions. An exception
+Outcomes of a solve are statuses (`scp_mpc.scp.plan.Status`), never exceptions. An exception
 means that the caller handed over something that cannot be meant; it names the argument and the
 offending number, and is raised before any state changes.
 """

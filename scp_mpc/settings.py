@@ -9,35 +9,46 @@ from scp_mpc.errors import BoundsError, InvalidArgumentError
 
 @dataclass(frozen=True)
 class QPSettings:
-    """Settings of the quadratic program's solvers.
+    """OSQP's settings, and what follows where it does not name the active set.
 
     Attributes:
-        accuracy: KKT residual at which a QP counts as solved; what OSQP does not bring there goes
-            to the rescue solver. Where both fall short, a feasible point below 1e-3 is used.
-        eps: OSQP's absolute and relative tolerance; polishing takes it from there to `accuracy`.
-        max_iterations: OSQP's iterations before the rescue solver is asked.
-        check_interval: Iterations between OSQP's checks for termination.
-        rho: OSQP's initial step size.
-        rescue: Whether to ask PIQP for what OSQP does not bring to `accuracy`.
-        cold: KKT residual of the starting point beyond which PIQP is asked first: the worse the
-            start, the more iterations OSQP needs.
+        rho: OSQP's step size, for rows of length one; anything from 10 to 30 does.
+        sigma: OSQP's regularisation.
+        alpha: OSQP's relaxation, between 0 and 2.
+        iterations: ADMM iterations to run, one after the other, until the active set is found.
+        repairs: Changes of the active set to try after each of these runs.
+        rescue: Whether to ask PIQP for what is not solved then.
     """
 
-    accuracy: float = 1e-7
-    eps: float = 1e-4
-    max_iterations: int = 150
-    check_interval: int = 5
-    rho: float = 0.1
+    rho: float = 10.0
+    sigma: float = 1e-6
+    alpha: float = 1.6
+    iterations: tuple[int, ...] = (10, 15, 25, 50, 100)
+    repairs: tuple[int, ...] = (1, 1, 3, 3, 7)
     rescue: bool = True
-    cold: float = 1.0
 
     def __post_init__(self) -> None:
         """Check every number, because OSQP does not."""
-        for name in ("accuracy", "eps", "rho", "cold"):
-            require_positive(name, getattr(self, name))
-        for name in ("max_iterations", "check_interval"):
-            as_count(name, getattr(self, name))
+        for name in ("rho", "sigma", "alpha"):
+            require_positive(f"qp.{name}", getattr(self, name))
+        if self.alpha >= 2:
+            raise BoundsError("qp.alpha", f"{self.alpha} is not below 2")
+        for name, least in (("iterations", 1), ("repairs", 0)):
+            counts = getattr(self, name)
+            if not isinstance(counts, tuple) or not counts:
+                raise InvalidArgumentError(f"qp.{name}", f"{counts!r} is not a tuple of counts")
+            for count in counts:
+                as_count(f"qp.{name}", count, least=least)
+        if len(self.iterations) != len(self.repairs):
+            raise InvalidArgumentError(
+                "qp.repairs", f"{len(self.repairs)} entries, but {len(self.iterations)} iterations"
+            )
         require_flags(self, "rescue")
+
+    @property
+    def stages(self) -> tuple[tuple[int, int], ...]:
+        """Iterations and repairs of each run."""
+        return tuple(zip(self.iterations, self.repairs, strict=True))
 
 
 @dataclass(frozen=True)
@@ -85,30 +96,27 @@ class Settings:
 
     Attributes:
         tolerance: KKT residual of the original problem at which a plan is certified.
-        max_iterations: Steps of one descent at most; each solves a convex subproblem, or two where
-            an extrapolation did not help.
-        condense: Eliminate the dynamics and solve small dense programs with an active-set method;
-            else, and where that has no answer, sparse programs go to OSQP first.
-        acceleration: On the sparse programs, extrapolate the linearisation point; see
-            `scp_mpc.solver.acceleration`.
+        max_iterations: SCP iterations of one run of the loop at most; each solves one program.
+        solver: Who solves the programs: "osqp", "piqp", or any solver of qpsolvers by its name.
         multi_start: Where an obstacle shapes the plan, try to pass it on the other sides too.
         multi_start_interval: Control steps between two such attempts while it keeps shaping the
             plan.
         max_candidates: How many of the ways past it to follow to the end; all are ranked.
         deadline: Seconds in which a step is to end: nothing is begun that is predicted, from how
             long it took lately, to end later. None: take the time it takes.
-        qp: Settings of the quadratic program's solvers.
+        history: Whether plans keep what happened in each SCP iteration.
+        qp: OSQP's settings.
         freshness: How old predictions may be; for the controller `MPC` alone.
     """
 
     tolerance: float = 1e-6
     max_iterations: int = 40
-    condense: bool = True
-    acceleration: bool = True
+    solver: str = "osqp"
     multi_start: bool = True
     multi_start_interval: int = 1
     max_candidates: int = 1
     deadline: float | None = None
+    history: bool = False
     qp: QPSettings = field(default_factory=QPSettings)
     freshness: Freshness = field(default_factory=Freshness)
 
@@ -120,16 +128,13 @@ class Settings:
         as_count("max_candidates", self.max_candidates)
         if self.deadline is not None:
             require_positive("deadline", self.deadline)
-        require_flags(self, "condense", "acceleration", "multi_start")
+        require_flags(self, "multi_start", "history")
+        if not isinstance(self.solver, str):
+            raise InvalidArgumentError("solver", f"{self.solver!r} is not a name")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
         if not isinstance(self.freshness, Freshness):
             raise InvalidArgumentError("freshness", f"{self.freshness!r} is not a Freshness")
-        if self.qp.accuracy > self.tolerance:
-            raise BoundsError(
-                "qp.accuracy",
-                f"{self.qp.accuracy:g} is coarser than the tolerance {self.tolerance:g}",
-            )
 
 
 def require_positive(argument: str, value: float) -> None:

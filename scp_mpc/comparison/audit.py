@@ -18,7 +18,7 @@ from scp_mpc.comparison.nlp import linear_model, require_round
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.margin import JointRisk, StageRisk
-from scp_mpc.solver.plan import Plan
+from scp_mpc.scp.plan import Plan
 
 _TOLERANCE = 1e-6  # [m], that of the settings
 _ROUNDING = float(np.finfo(np.float64).eps)

@@ -4,19 +4,17 @@ For N = 8 and N = 30 (scenarios 2 and 1), and where asked for 5 and 12 obstacles
 is recorded once. Every solver then solves its steps from the same guess, twenty in a row as in a
 control loop, in turns of shuffled order, so that the machine's noise hits all alike:
 
-    scp_mpc                 from the guess alone: like for like
-    scp_mpc (both sides)    default settings, trying the other sides at every step
-    scp_mpc (osqp)          sparse programs, OSQP first and PIQP for what it does not finish
-    scp_mpc (osqp alone)    the same without PIQP
-    scp_mpc (piqp)          sparse programs, PIQP first
-    others                  see their modules
+    scp_mpc                  from the guess alone: like for like
+    scp_mpc (multi-start)    default settings, trying other ways past the obstacles at every step
+    scp_mpc (piqp)           from the guess alone, with PIQP for all programs
+    others                   see their modules
 
 Only scp_mpc uses the multipliers of the guess; the peers have no use for them.
 """
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +34,7 @@ from scp_mpc.comparison.timing_figure import timing_figure
 from scp_mpc.comparison.timing_table import timing_table
 from scp_mpc.problem import Problem
 from scp_mpc.provenance import provenance
-from scp_mpc.settings import QPSettings, Settings
+from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
@@ -45,11 +43,25 @@ SLOW_STEPS = 20
 _SCENARIOS: tuple[Scenario | Crowd, ...] = (SCENARIOS["scenario-2"], SCENARIOS["scenario-1"])
 CROWDS = (Crowd(30, 5), Crowd(30, 12))
 _SHORT = 10  # horizon up to which every solver is quick enough for every step
-_SLOW = {"slsqp": 1, "sqp-osqp": 1, "sqp-hpipm": 5, "scp_mpc (osqp alone)": 1}  # and their share
-_NOT_FOR_CROWDS = ("slsqp", "sqp-osqp", "sqp-qrqp", "scp_mpc (osqp alone)")  # up to minutes
+_SLOW = {"slsqp": 1, "sqp-osqp": 1, "sqp-hpipm": 5}  # and their share
+_NOT_FOR_CROWDS = ("slsqp", "sqp-osqp", "sqp-qrqp")  # up to minutes
 _BLOCK = 20  # steps that a solver solves in a row
 
 _log = logging.getLogger(__name__)
+
+Builders = Mapping[str, Callable[[], Peer]]
+
+
+def everyone(problem: Problem) -> Builders:
+    """All solvers, set up for a problem when they are called, by name."""
+    return {
+        "scp_mpc": partial(Ours, problem, Settings(multi_start=False)),
+        "scp_mpc (multi-start)": partial(Ours, problem, challenge=True),
+        "scp_mpc (piqp)": partial(Ours, problem, Settings(multi_start=False, solver="piqp")),
+        "ipopt": partial(Ipopt, problem),
+        **{name: partial(Staged, problem, name) for name in SOLVERS},
+        "slsqp": partial(Slsqp, problem),
+    }
 
 
 def measure(
@@ -58,6 +70,7 @@ def measure(
     seed: int = 0,
     slow_steps: int = SLOW_STEPS,
     advance: Callable[[], object] = lambda: None,
+    solvers: Callable[[Problem], Builders] = everyone,
 ) -> list[Attempts]:
     """Record a scenario and let every solver solve its steps, in this process.
 
@@ -67,19 +80,21 @@ def measure(
         seed: Seed of the disturbance and of the solvers' order.
         slow_steps: At horizons beyond 10, SLSQP solves every k-th step only: about this many.
         advance: Called twice per step, when it is recorded and when it is solved by all.
+        solvers: Who takes part.
     """
     as_count("steps", steps)
     as_count("slow_steps", slow_steps)
     problem = scenario.problem("axes")
     sequence = record(scenario, steps, seed, problem, advance=advance)
-    peers = _peers(problem)
+    peers = _set_up(problem, solvers(problem))
     every = dict.fromkeys(peers, 1)
     if problem.horizon > _SHORT:
-        every |= {name: max(1, steps // (slow_steps * share)) for name, share in _SLOW.items()}
+        slow = {name: share for name, share in _SLOW.items() if name in peers}
+        every |= {name: max(1, steps // (slow_steps * share)) for name, share in slow.items()}
     obstacles = len(sequence[0].obstacles)
     contest = [
-        Attempts(name, problem.horizon, obstacles, len(range(0, steps, every[name])), {})
-        for name in peers
+        Attempts(name, problem.horizon, obstacles, len(range(0, steps, k)), {}, k)
+        for name, k in every.items()
     ]
     for peer in peers.values():
         _warm_up(peer, sequence[0])
@@ -108,6 +123,7 @@ def main(
     slow_steps: int = SLOW_STEPS,
     echo: Callable[[str], None] = _log.info,
     crowds: bool = False,
+    solvers: Callable[[Problem], Builders] = everyone,
 ) -> None:
     """Run the benchmark in a process of one thread, echo its table and write its files.
 
@@ -119,10 +135,10 @@ def main(
         slow_steps: See `measure`.
         echo: Takes the Markdown table.
         crowds: Five and twelve obstacles too.
+        solvers: Who takes part: a module's function, for the other process to find.
     """
-    contests = in_one_thread(
-        _contests, _SCENARIOS + (CROWDS if crowds else ()), steps, seed, slow_steps
-    )
+    scenarios = _SCENARIOS + (CROWDS if crowds else ())
+    contests = in_one_thread(_contests, scenarios, steps, seed, slow_steps, solvers)
     summary = [row for contest in contests for row in rows(contest)]
     for row in summary:
         if row["median_ms"] is None:
@@ -141,35 +157,25 @@ def main(
 
 
 def _contests(
-    scenarios: Sequence[Scenario | Crowd], steps: int, seed: int, slow_steps: int
+    scenarios: Sequence[Scenario | Crowd],
+    steps: int,
+    seed: int,
+    slow_steps: int,
+    solvers: Callable[[Problem], Builders],
 ) -> list[list[Attempts]]:
     """One contest per scenario, with a progress bar on a terminal."""
     # Among several obstacles a step takes some of the peers seconds.
     counts = [max(steps // 4, 1) if isinstance(one, Crowd) else steps for one in scenarios]
     with progress(2 * sum(counts)) as advance:
         return [
-            measure(one, count, seed, slow_steps, advance)
+            measure(one, count, seed, slow_steps, advance, solvers)
             for one, count in zip(scenarios, counts, strict=True)
         ]
 
 
-def _peers(problem: Problem) -> dict[str, Peer | None]:
+def _set_up(problem: Problem, builders: Builders) -> dict[str, Peer | None]:
     """The solvers by name; None for one that is not installed, whose row is kept."""
-
-    def sparse(qp: QPSettings) -> Peer:
-        return Ours(problem, Settings(multi_start=False, condense=False, qp=qp))
-
     peers: dict[str, Peer | None] = {}
-    builders: dict[str, Callable[[], Peer]] = {
-        "scp_mpc": lambda: Ours(problem, Settings(multi_start=False)),
-        "scp_mpc (both sides)": lambda: Ours(problem, challenge=True),
-        "scp_mpc (osqp)": lambda: sparse(QPSettings()),
-        "scp_mpc (osqp alone)": lambda: sparse(QPSettings(rescue=False, max_iterations=4000)),
-        "scp_mpc (piqp)": lambda: sparse(QPSettings(cold=1e-300)),
-        "ipopt": lambda: Ipopt(problem),
-        **{name: partial(Staged, problem, name) for name in SOLVERS},
-        "slsqp": lambda: Slsqp(problem),
-    }
     for name, build in builders.items():
         if problem.max_obstacles > 1 and name in _NOT_FOR_CROWDS:
             continue

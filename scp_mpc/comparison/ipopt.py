@@ -25,7 +25,7 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.solver.guess import as_iterate
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.trajectory import Trajectory
 

@@ -20,7 +20,7 @@ from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel, as_linear
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate
 
 
 def linear_model(problem: Problem) -> LinearModel:

@@ -11,8 +11,8 @@ from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
-from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.scp import SCP
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.solver import SCP
 from scp_mpc.trajectory import Trajectory
 
 
@@ -53,4 +53,5 @@ class Ours:
             seconds=seconds,
             ok=plan.ok,
             message=plan.status.value,
+            qps=plan.qps,
         )

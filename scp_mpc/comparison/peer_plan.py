@@ -1,7 +1,7 @@
 """What every solver of the comparison returns, judged by one and the same yardstick."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from numpy.typing import ArrayLike
@@ -11,7 +11,7 @@ from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.errors import ScpMpcError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.solver.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.trajectory import Trajectory
 
@@ -37,6 +37,7 @@ class PeerPlan:
         seconds: Wall time of the solve, without the judging.
         ok: Whether the solver itself reported success.
         message: What it reported.
+        qps: Quadratic programs by the solver that finished them; empty if it does not tell.
     """
 
     X: FloatArray
@@ -47,6 +48,7 @@ class PeerPlan:
     seconds: float
     ok: bool
     message: str
+    qps: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def judged(

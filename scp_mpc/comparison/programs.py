@@ -14,10 +14,10 @@ from scp_mpc.comparison.progress import progress
 from scp_mpc.comparison.sequence import record
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.simulation.scenarios import SCENARIOS
-from scp_mpc.solver.iterate import moved
+from scp_mpc.scp.iterate import moved
 from scp_mpc.solver.oracle import Oracle
-from scp_mpc.solver.program import QuadraticProgram
-from scp_mpc.solver.scp import SCP
+from scp_mpc.qp.program import QuadraticProgram
+from scp_mpc.scp.solver import SCP
 from scp_mpc.solver.sides import candidates
 from scp_mpc.solver.step_data import StepData
 from scp_mpc.solver.subproblem import Subproblem

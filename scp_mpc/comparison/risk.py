@@ -50,8 +50,8 @@ from scp_mpc.simulation.realisations import (
     applicable_couplings,
     sample_paths,
 )
-from scp_mpc.solver.plan import Plan
-from scp_mpc.solver.scp import SCP
+from scp_mpc.scp.plan import Plan
+from scp_mpc.scp.solver import SCP
 
 NAME = "risk"  # of the files
 SAMPLES = 100_000

@@ -14,8 +14,8 @@ from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import Scenario
-from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.scp import SCP
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.solver import SCP
 
 
 @dataclass(frozen=True, eq=False)

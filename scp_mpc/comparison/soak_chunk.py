@@ -16,7 +16,7 @@ import numpy as np
 from scp_mpc.comparison.audit import audit
 from scp_mpc.comparison.soak_worlds import FAULTS, Kind, World, kinds
 from scp_mpc.control.mpc import MPC
-from scp_mpc.solver.plan import Plan
+from scp_mpc.scp.plan import Plan
 
 EPISODE = 50  # control steps
 PER_DECADE = 50  # bins of the histogram of seconds

@@ -59,7 +59,7 @@ def kinds() -> list[Kind]:
         ("biased limits", 2, 8, {"u_min": [-0.2, 0.3], "u_max": [2.0, 1.5]}, Settings()),
         ("in space", 1, 8, {"model": DoubleIntegrator(_DT, 3)}, Settings(multi_start=False)),
         ("no time", 3, 8, {}, Settings(deadline=_SHORT)),
-        ("sparse", 0.3, 8, {}, Settings(condense=False, multi_start=False)),
+        ("rescue", 0.3, 8, {}, Settings(solver="piqp", multi_start=False)),
         ("two iterations", 2, 15, {}, Settings(max_iterations=2)),
         ("stage risk", 0.5, 15, {"margin": StageRisk(0.05)}, Settings()),
         ("2 ms", 2, 30, {}, Settings(deadline=2e-3)),

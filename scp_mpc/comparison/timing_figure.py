@@ -12,10 +12,9 @@ from scp_mpc.simulation.scenarios import DT
 # Okabe and Ito's colours, told apart by any eye; line styles tell apart those that share one.
 _STYLES = {
     "scp_mpc": ("#0072B2", "-"),
-    "scp_mpc (both sides)": ("#56B4E9", "-"),
-    "scp_mpc (osqp)": ("#0072B2", "--"),
-    "scp_mpc (osqp alone)": ("#0072B2", ":"),
-    "scp_mpc (piqp)": ("#0072B2", "-."),
+    "scp_mpc (multi-start)": ("#56B4E9", "-"),
+    "scp_mpc, one start": ("#56B4E9", "-"),
+    "scp_mpc (piqp)": ("#CC79A7", "-"),
     "ipopt": ("#D55E00", "-"),
     "fatrop": ("#E69F00", "-"),
     "sqp-qrqp": ("#009E73", "-"),
@@ -43,7 +42,7 @@ def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
                 )
         axes.axvline(1e3 * DT, color="black", linewidth=1.2, linestyle=":")
         axes.annotate(
-            f"sampling time {DT:g} s",
+            f"the report's {1e3 * DT:g} ms",
             (1e3 * DT, 0.04),
             xytext=(-5, 0),
             textcoords="offset points",
@@ -53,6 +52,7 @@ def timing_figure(contests: Sequence[Sequence[Attempts]]) -> Figure:
             va="bottom",
         )
         axes.set_xscale("log")
+        axes.set_ylim(-0.02, 1.02)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_title(_title(contest[0]), fontsize=14)
         axes.set_xlabel("time per control step [ms]", fontsize=13)

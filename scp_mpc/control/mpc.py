@@ -21,11 +21,11 @@ from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import ROUNDING, Problem
 from scp_mpc.settings import Settings
-from scp_mpc.solver.iterate import Iterate
-from scp_mpc.solver.plan import Plan, Status
-from scp_mpc.solver.scp import SCP
-from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.plan import Plan, Status
+from scp_mpc.scp.solver import SCP
+from scp_mpc.scp.step import Step
+from scp_mpc.scp.deadline import Clock
 
 _log = logging.getLogger(__name__)
 
@@ -116,14 +116,14 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
-        watch = self._solver.stopwatch()
+        clock = self._solver.clock()
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)
             last = self._applied if self.problem.limits_rates else None
             if u_last is not None:
                 last = as_array("u_last", u_last, (self.problem.model.nu,))
-            plan = self._plan(x0, x_ref, recall, robot_covariance, watch, last)
+            plan = self._plan(x0, x_ref, recall, robot_covariance, clock, last)
             sound = self._within(plan, last)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref, last)
@@ -157,19 +157,19 @@ class MPC:
         x_ref: ArrayLike,
         recall: Recall,
         robot_covariance: ArrayLike | None,
-        watch: Stopwatch,
+        clock: Clock,
         last: FloatArray | None,
     ) -> Plan:
         if recall.stale is None:
-            challenge = self._steps_touching % self.settings.multi_start_interval == 0
-            shifted = None if self._last is None else self._shifted
+            due = self._steps_touching % self.settings.multi_start_interval == 0
             return self._solver.solve_from(
-                x0, x_ref, recall.obstacles, shifted, challenge, robot_covariance, watch, last
+                *(x0, x_ref, recall.obstacles, self.nominal(), due),
+                *(robot_covariance, clock, last),
             )
         if self.settings.freshness.beyond == "refuse":
             raise recall.stale
         # Bad arguments are refused before the robot brakes.
-        StepData.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
+        Step.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
         _log.warning("%s: braking", recall.stale)
         return self._solver.brake(x0, x_ref, Status.STALE, last)
 

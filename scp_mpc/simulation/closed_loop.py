@@ -17,7 +17,7 @@ from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import DT, STEPS, Scenario
-from scp_mpc.solver.plan import Plan
+from scp_mpc.scp.plan import Plan
 
 
 class Controller(Protocol):

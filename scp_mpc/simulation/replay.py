@@ -22,7 +22,7 @@ from scp_mpc.safety.margin import Containment, Promise
 from scp_mpc.settings import Freshness, Settings, require_positive
 from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
-from scp_mpc.solver.plan import Status
+from scp_mpc.scp.plan import Status
 
 DT = 0.2  # [s]
 TRACKING = TrackerSettings(confirm=1)  # with names nothing is a false alarm: tell of it at once

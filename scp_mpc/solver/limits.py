@@ -19,7 +19,7 @@ from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.problem import Problem
 from scp_mpc.solver.iterate import Iterate
 from scp_mpc.solver.program import QuadraticProgram
-from scp_mpc.solver.sparse_blocks import SparseBlocks
+from scp_mpc.qp.sparse_blocks import SparseBlocks
 
 _PAID = 0.01  # share of v; an excess whose bound pushes by more less than v is not meant
 

@@ -28,7 +28,7 @@ from scp_mpc.solver.iterate import Iterate, Multipliers
 from scp_mpc.solver.limits import Limits
 from scp_mpc.solver.program import KKTResiduals, QuadraticProgram
 from scp_mpc.solver.sampling import LinearSampling, Sampling
-from scp_mpc.solver.sparse_blocks import SparseBlocks
+from scp_mpc.qp.sparse_blocks import SparseBlocks
 
 
 class Subproblem:

@@ -1,0 +1,256 @@
+"""The exact solution of a convex program on a guessed active set, and the guess's repair.
+
+A solver that stops early names the active set; from there one Cholesky factor gives all digits.
+All constraints of the program are then checked: who pulls is dropped, who is violated joins, and
+the system is solved again. Nothing leaves this file that is not the solution of its program.
+
+The program is condensed: dynamics eliminated, in coordinates in which its Hessian is the identity,
+
+    minimise |v|^2 / 2   subject to   lower <= F v <= upper,   A v >= b
+
+Constraints with a cap yield where it takes more than that force to keep them: the exact L1 penalty.
+
+Notation:
+    v       (nv,)       inputs and sizes
+    F       (nf, nv)    responses of the bounded entries; the first nv of them are a square box
+    A       (K, nv)     half-spaces
+    force   (nf + K,)   multipliers, positive at lower bounds and half-spaces
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.lapack import dposv, dpotrs, dpstrf
+
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+
+_ACCURACY = 1e-9  # of a constraint, in its own unit
+_SHARE = 0.5  # of the worst: who is no better goes along
+_PULL = 1e-10  # of the largest force: a force the wrong way that is none
+_DEPENDENT = 1e-11  # of the largest pivot
+
+
+@dataclass(frozen=True, eq=False)
+class CondensedQP:
+    """The values of one program.
+
+    Attributes:
+        F: (nf, nv) responses of the bounded entries.
+        lower: (nf,) bounds of F v.
+        upper: (nf,) likewise.
+        A: (K, nv) half-spaces.
+        b: (K,) their right-hand sides.
+        unbox: (nv, nv) inverse of F[:nv].
+        cap: (nf + K,) largest force on each constraint: finite where it may yield. None where
+            none may.
+        least: Cost at v = 0.
+    """
+
+    F: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    A: FloatArray
+    b: FloatArray
+    unbox: FloatArray
+    cap: FloatArray | None = None
+    least: float = 0.0
+
+    def merit(self, v: FloatArray) -> float:
+        """Cost at v (nv,) and what it pays for constraints that yield."""
+        merit = self.least + float(v @ v) / 2
+        if self.cap is None:
+            return merit
+        bounded = self.F @ v
+        beyond = np.maximum(self.lower - bounded, bounded - self.upper)
+        short = np.concatenate([beyond, self.b - self.A @ v])
+        soft = np.isfinite(self.cap)
+        return merit + float(self.cap[soft] @ np.maximum(short[soft], 0.0))
+
+    def dual_bound(self, force: FloatArray) -> float:
+        """Lower bound of the optimum from any multipliers (nf + K,), stretched as they like best.
+
+        With g the pull of all forces and c what their constraints ask of v, the dual function at t
+        times the forces is t c - t^2 |g|^2 / 2.
+        """
+        force = self._admissible(force)
+        gain, pull = self._asked(force), self._pull(force)
+        pull2 = float(pull @ pull)
+        if gain <= 0 or not pull2 > 0:
+            return self.least
+        stretch = gain / pull2
+        if self.cap is not None:
+            soft = np.isfinite(self.cap) & (force != 0)
+            if soft.any():
+                stretch = min(stretch, float((self.cap[soft] / np.abs(force[soft])).min()))
+        return self.least + stretch * gain - stretch * stretch * pull2 / 2
+
+    def proves_infeasible(self, force: FloatArray) -> bool:
+        """Whether multipliers (nf + K,) show that no v in the box meets all constraints (Farkas).
+
+        Their sum is a constraint by itself; it is held against the best that the box can do.
+        """
+        if self.cap is not None and np.isfinite(self.cap[len(self.F) :]).any():
+            return False
+        force, n = self._admissible(force), len(self.unbox)
+        force[:n] = 0.0
+        if self.cap is not None:
+            force[np.isfinite(self.cap)] = 0.0
+        asked = self._asked(force)
+        if asked <= 0:
+            return False
+        pull = self._pull(force) @ self.unbox
+        best = np.maximum(pull * self.lower[:n], pull * self.upper[:n]).sum()
+        return bool(asked > best + _ACCURACY * np.abs(force).sum())
+
+    def _admissible(self, force: FloatArray) -> FloatArray:
+        """Forces without those that have no bound to push at."""
+        nf, force = len(self.F), force.copy()
+        force[nf:] = np.maximum(force[nf:], 0.0)
+        box = force[:nf]
+        box[(box > 0) & (self.lower <= -_NONE)] = 0.0
+        box[(box < 0) & (self.upper >= _NONE)] = 0.0
+        return force
+
+    def _asked(self, force: FloatArray) -> float:
+        box, n = force[: len(self.F)], len(self.F)
+        at = np.where(box > 0, self.lower, self.upper)
+        return float(box[box != 0] @ at[box != 0] + force[n:] @ self.b)
+
+    def _pull(self, force: FloatArray) -> FloatArray:
+        n = len(self.F)
+        pull: FloatArray = force[:n] @ self.F + force[n:] @ self.A
+        return pull
+
+
+_NONE = 1e29  # a bound beyond this is none
+
+
+@dataclass(frozen=True, eq=False)
+class QPSolution:
+    """Point, forces and active set of a program; bounds first, then half-spaces.
+
+    Attributes:
+        v: (nv,) point.
+        force: (nf + K,) positive at lower bounds and half-spaces.
+        active: (nf + K,) -1 at a lower bound or half-space, 1 at an upper bound, 0 elsewhere.
+        capped: (nf + K,) constraints that yield at the largest force.
+        rows: (k, nv) responses of the active constraints that hold with equality.
+        indices: (k,) which they are.
+        factor: (k, k) upper Cholesky factor of rows rows'.
+    """
+
+    v: FloatArray
+    force: FloatArray
+    active: IntArray
+    capped: BoolArray
+    rows: FloatArray
+    indices: IntArray
+    factor: FloatArray
+
+
+def solve_on(qp: CondensedQP, active: IntArray, capped: BoolArray) -> QPSolution:
+    """Solve for exactly this active set; of rows that depend on others the surplus is left out."""
+    nf = len(qp.F)
+    v, force = np.zeros(qp.F.shape[1]), np.zeros(len(active))
+    indices = active.nonzero()[0]
+    if qp.cap is not None and capped.any():
+        force[capped] = -active[capped] * qp.cap[capped]
+        v = force[:nf] @ qp.F + force[nf:] @ qp.A
+        indices = (active * ~capped).nonzero()[0]
+    if not len(indices):
+        none = np.zeros((0, len(v)))
+        return QPSolution(v, force, active, capped, none, indices, np.zeros((0, 0)))
+    split = int(np.searchsorted(indices, nf))
+    bounds, spaces = indices[:split], indices[split:] - nf
+    rows = np.concatenate([qp.F[bounds], qp.A[spaces]])
+    at = np.where(active[bounds] < 0, qp.lower[bounds], qp.upper[bounds])
+    wanted = np.concatenate([at, qp.b[spaces]]) - rows @ v
+    factor, strength, info = dposv(rows @ rows.T, wanted)
+    if info != 0 or _near_dependent(factor):
+        keep = _independent(rows)
+        indices, rows, wanted = indices[keep], rows[keep], wanted[keep]
+        factor, strength, _ = dposv(rows @ rows.T, wanted)
+        active = active.copy()
+        active[np.setdiff1d(active.nonzero()[0], np.append(indices, capped.nonzero()[0]))] = 0
+    force[indices] = strength
+    return QPSolution(v + strength @ rows, force, active, capped, rows, indices, factor)
+
+
+def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -> bool:
+    """Whether all forces push the right way, and all constraints that do not yield hold."""
+    if (solution.force * solution.active).max(initial=0.0) > 0.0:
+        return False
+    return _violations(qp, solution)[0].max(initial=0.0) <= tolerance
+
+
+def settled(
+    qp: CondensedQP, active: IntArray, capped: BoolArray, repairs: int
+) -> tuple[QPSolution, int] | None:
+    """The program's solution, if this active set leads to it; and how many systems that took.
+
+    One wrong constraint spoils the forces of its neighbours, so that only the worst are changed at
+    a time: who pulls the hardest leaves, or, if nobody pulls, who is violated the most joins.
+
+    Args:
+        qp: The program.
+        active: (nf + K,) guess, as in `QPSolution`.
+        capped: (nf + K,) guess of those that yield.
+        repairs: Changes of the guess at most.
+    """
+    for solves in range(1, repairs + 2):
+        solution = solve_on(qp, active, capped)
+        force, active, capped = solution.force, solution.active.copy(), capped.copy()
+        if not np.isfinite(solution.v.sum()):
+            return None
+        pull = np.where(capped, 0.0, force * active)
+        depth, side = _violations(qp, solution)
+        over = relieved = np.zeros(0)
+        if qp.cap is not None:
+            over = np.where(capped, 0.0, np.abs(force) - qp.cap * (1 + 1e-9)) * (pull < 0)
+            relieved = np.where(capped, -depth, 0.0)
+            depth = np.where(capped, 0.0, depth)
+        worst_pull = pull.max(initial=0.0)
+        if worst_pull > _PULL * np.abs(force).max(initial=1.0):
+            active[pull >= _SHARE * worst_pull] = 0
+        elif over.max(initial=0.0) > 0:
+            capped[over > 0] = True
+        elif relieved.max(initial=0.0) > _ACCURACY:
+            capped[relieved >= _SHARE * relieved.max()] = False
+        elif depth.max(initial=0.0) > _ACCURACY:
+            joins = (depth >= _SHARE * depth.max()) & (active == 0)
+            if not joins.any():
+                return None
+            active[joins] = side[joins]
+        else:
+            return replace(solution, force=np.where(pull > 0, 0.0, force)), solves
+    return None
+
+
+def _violations(qp: CondensedQP, solution: QPSolution) -> tuple[FloatArray, IntArray]:
+    """By how much each constraint (nf + K,) is violated, negative if it holds; and at which side."""
+    nf, v = len(qp.F), solution.v
+    bounded = qp.F @ v
+    below, above = qp.lower - bounded, bounded - qp.upper
+    depth, side = np.empty(len(solution.force)), np.full(len(solution.force), -1, dtype=np.intp)
+    np.maximum(below, above, out=depth[:nf])
+    depth[nf:] = qp.b - qp.A @ v
+    side[:nf][above > below] = 1
+    return depth, side
+
+
+def _near_dependent(factor: FloatArray) -> bool:
+    pivots = factor.diagonal()
+    return bool(pivots.min() <= np.sqrt(_DEPENDENT) * pivots.max())
+
+
+def _independent(rows: FloatArray) -> IntArray:
+    """Indices of a largest set of rows that do not depend on each other: pivoted Cholesky."""
+    gram = rows @ rows.T
+    _, pivots, rank, _ = dpstrf(gram, tol=_DEPENDENT * float(gram.diagonal().max()))
+    return np.sort(pivots[:rank] - 1)
+
+
+def solved_with(factor: FloatArray, right: FloatArray) -> FloatArray:
+    """Apply the inverse of rows rows' by its factor."""
+    solution: FloatArray = dpotrs(factor, right)[0]
+    return solution

@@ -1,0 +1,183 @@
+"""Who solves a program, and how far that is believed: the solver asked, the exact solve, the rescue.
+
+    repeat:  run the solver a little further        (OSQP: 10, 15, 25, .. iterations)
+             the signs of its multipliers            -> a guess of the active set
+             solve exactly on it, check all rows     -> solution, or a better guess (active_set.py)
+    until    a guess holds, or the multipliers prove that there is no solution, or the budget is up
+    rescue:  PIQP, judged in the same way
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.qp.active_set import CondensedQP, QPSolution, settled
+from scp_mpc.qp.osqp import OSQP
+from scp_mpc.qp.others import PIQP, Named, installed, known
+from scp_mpc.qp.program import Backend, QuadraticProgram
+from scp_mpc.settings import QPSettings
+
+_DIRECT = 2  # systems up to which the active set counts as the solver's own: one, and one repair
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Where the constraints of a condensed program stand in the sparse one; -1 for nowhere.
+
+    Attributes:
+        place: (nf + K,) its row.
+        below: (nf + K,) the row that keeps the slack of its lower bound from being negative.
+        above: (nf + K,) likewise of its upper bound.
+    """
+
+    place: IntArray
+    below: IntArray | None = None
+    above: IntArray | None = None
+
+    def active(self, y: FloatArray, noise: float) -> tuple[IntArray, BoolArray]:
+        """The active set that multipliers y (m,) name, and which of it yields.
+
+        Args:
+            y: The multipliers.
+            noise: Share of the largest one below which one is none.
+        """
+        if noise:
+            y = np.where(np.abs(y) > noise * np.abs(y).max(), y, 0.0)
+        active = np.zeros(len(self.place), dtype=np.intp)
+        there = self.place >= 0
+        active[there] = np.sign(y[self.place[there]])
+        capped = np.zeros(len(active), dtype=np.bool_)
+        if self.below is not None and self.above is not None:
+            pin = np.where(active < 0, self.below, self.above)
+            capped = (active != 0) & (pin >= 0) & (y[pin] == 0)
+        return active, capped
+
+    def forces(self, y: FloatArray) -> FloatArray:
+        """Multipliers y (m,) as forces (nf + K,), positive at lower bounds."""
+        return np.where(self.place >= 0, -y[self.place], 0.0)
+
+
+class ProgramSolver:
+    """Solves the convex programs of one pattern.
+
+    Args:
+        program: Whose values are rewritten between calls.
+        equations: (k,) its rows with equal bounds.
+        name: The solver to ask first.
+        settings: OSQP's, and whether to ask PIQP for what that does not finish.
+
+    Attributes:
+        backend: The solver.
+        finished: Programs by who finished them: the solver, "repaired" where its active set took
+            more than one repair, "piqp"; and "cut", given up because they cannot win.
+    """
+
+    def __init__(
+        self, program: QuadraticProgram, equations: IntArray, name: str, settings: QPSettings
+    ) -> None:
+        """Set everything up: later calls only write numbers."""
+        self.backend = backend(program, equations, name, settings)
+        self._rescue = None
+        if settings.rescue and name != "piqp":
+            self._rescue = PIQP(program, equations)
+        self.finished: Counter[str] = Counter()
+        self.iterations: list[int] = []
+
+    def solve(
+        self,
+        qp: CondensedQP,
+        rows: Rows,
+        start: tuple[FloatArray, FloatArray],
+        rescue: bool = True,
+    ) -> QPSolution | None:
+        """Return the program's solution; None where there is none, or nobody found it.
+
+        Args:
+            qp: The condensed program; the sparse one has been written.
+            rows: Which row is which.
+            start: x (n,) and y (m,) to start from.
+            rescue: Whether there is time for PIQP.
+        """
+        self.backend.load(start)
+        for effort, repairs in self.backend.stages:
+            point = self.backend.run(effort)
+            if point is None:
+                break
+            end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
+            if end is not None:
+                self._count(self.backend.name, end[1])
+                return end[0]
+            if qp.proves_infeasible(rows.forces(point[1])):
+                self.finished["infeasible"] += 1
+                return None
+        if not rescue or self._rescue is None:
+            return None
+        self._rescue.load(start)
+        point = self._rescue.run(1)
+        if point is None:
+            return None
+        (_, repairs), noise = self._rescue.stages[0], self._rescue.noise
+        end = settled(qp, *rows.active(point[1], noise), repairs)
+        if end is None:
+            return None
+        self.finished["piqp"] += 1
+        return end[0]
+
+    def rank(
+        self, qp: CondensedQP, rows: Rows, start: tuple[FloatArray, FloatArray], limit: float = inf
+    ) -> tuple[QPSolution | None, tuple[FloatArray, FloatArray]]:
+        """Solve with the first two stages alone, and stop where the optimum exceeds the limit.
+
+        Returns:
+            The solution, or None; and the point reached, to start from in the next control step.
+        """
+        self.backend.load(start)
+        for effort, repairs in self.backend.stages[:2]:
+            point = self.backend.run(effort)
+            if point is None:
+                return None, start
+            start = point
+            if qp.dual_bound(rows.forces(point[1])) > limit:
+                self.finished["cut"] += 1
+                return None, start
+            end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
+            if end is not None:
+                self._count(self.backend.name, end[1])
+                return end[0], start
+        self.finished["cut"] += 1
+        return None, start
+
+    def _count(self, name: str, solves: int) -> None:
+        self.finished[name if solves <= _DIRECT else "repaired"] += 1
+
+
+def backend(
+    program: QuadraticProgram, equations: IntArray, name: str, settings: QPSettings
+) -> Backend:
+    """Return the solver of that name.
+
+    Raises:
+        InvalidArgumentError: There is none, or it is not installed.
+    """
+    if name == "osqp":
+        return OSQP(program, settings)
+    if name == "piqp":
+        return PIQP(program, equations)
+    require_solver(name)
+    return Named(program, name, equations)
+
+
+def require_solver(name: object) -> None:
+    """Raise `InvalidArgumentError` unless there is a solver of that name."""
+    there = ["osqp", "piqp", *installed()]
+    if name in there:
+        return
+    if name in known():
+        raise InvalidArgumentError(
+            "solver", f"{name!r} is not installed: pip install 'qpsolvers[{name}]'"
+        )
+    raise InvalidArgumentError("solver", f"{name!r} is none of {', '.join(there)}")

@@ -1,0 +1,213 @@
+"""Candidates that pass an obstacle on its other sides, or one stage earlier or later.
+
+One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
+of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
+late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that
+ignores the obstacles; but during one conflict it is put off or brought forward by a stage or two of
+the relative motion and pushed out of the no-go set, and during the other conflicts it is the
+present plan. For an obstacle that crosses, the two sides are before it and behind it. Linearising
+about the path gives half-spaces on that side, sound as any. Polytopes often stand together, as
+walls do: there are candidates that pass all of them on one side, the first few on either, or none.
+
+Notation:
+    C                   points of the plan, K in each stage; K is not 1 between fast samples only
+    p       (C, d)      positions of the plan that ignores the obstacles
+    v       (d,)        motion relative to the obstacle in one stage, over the conflict [m]
+    n       (d,)        side: a unit vector square to v
+    tau                 stages by which the candidate passes later (negative) or earlier
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain, islice, product
+
+import numpy as np
+
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.scp.detours import WAYS, Ellipsoids, Walls
+from scp_mpc.scp.step import Step
+
+MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
+MOST_AMONG_WALLS = 32  # the same where there are polytopes
+_AROUND = 3  # stages before and after a conflict that a candidate may change
+_STILL = 1e-6  # relative motion in one stage, over the distance, that counts as none
+_MIXED = 3  # polytopes whose sides are tried in all combinations
+_COSINE = 0.9  # of the angle between two directions that count as one side
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Where and when to pass which obstacle.
+
+    Attributes:
+        obstacle: Its index.
+        normal: (d,) from the obstacle to where the path passes.
+        time: Stages by which it passes earlier than the free plan would.
+        path: (C, d) positions to linearise about.
+    """
+
+    obstacle: int
+    normal: FloatArray
+    time: float
+    path: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Passing:
+    """How a plan passes the obstacles.
+
+    Attributes:
+        path: (C, d) its positions.
+        touched: (J, C) which obstacles push it, at which points.
+    """
+
+    path: FloatArray
+    touched: BoolArray
+
+
+def candidates(
+    step: Step,
+    free: FloatArray,
+    present: FloatArray,
+    s: FloatArray,
+    most: int = MAX_CANDIDATES,
+) -> list[Side]:
+    """Return the ways past the obstacles in conflict, the first conflict first; none without any.
+
+    Args:
+        step: The control step.
+        free: (C, d) positions of the plan that ignores the obstacles.
+        present: (C, d) positions of the best plan so far.
+        s: (M,) sizes of the ellipsoids.
+        most: How many ways to return at most.
+    """
+    conflict = step.conflicts(free, s)
+    first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
+    count = np.count_nonzero(first < conflict.shape[1])
+    order = np.argsort(first, kind="stable")[:count].tolist()
+    ways = (
+        side
+        for j in order
+        for side in _ways(
+            step, free, _elsewhere(step, free, present, conflict, j), s, j, conflict[j]
+        )
+    )
+    if step.shapes is not None:
+        together = _together(step, free, s, conflict, step.shapes.slots)
+        return list(islice(chain(together, ways), most))
+    return list(islice(ways, most))
+
+
+def _together(
+    step: Step, free: FloatArray, s: FloatArray, conflict: BoolArray, walls: IntArray
+) -> Iterator[Side]:
+    """Stay in front of the polytopes in conflict; or pass them, each on either side."""
+    hit = conflict[walls]
+    if not hit.any():
+        return
+    points = np.flatnonzero(hit.any(axis=0))
+    order = np.argsort(np.where(hit.any(axis=1), hit.argmax(axis=1), len(free)), kind="stable")
+    walls = walls[order]
+    j = int(walls[0])
+    v, normals = _directions(free - step.means[j, 1:], points, step.nodes.count)
+    waiting = free.copy()
+    waiting[points[0] :] = free[points[0] - 1] if points[0] else step.here
+    yield Side(j, -v / np.linalg.norm(v), 0.0, waiting)
+    body = Walls.of(step, s, walls, slice(0, len(free)))
+    for n in normals if len(walls) > 1 else ():
+        yield Side(j, n, 0.0, body.aside(free, n))
+    for mixed in product(*[normals[:2]] * min(len(walls), _MIXED)):
+        if len(walls) > 1 and any(n is not mixed[0] for n in mixed):
+            # Those beyond the first few go with the last of them.
+            sides = np.array([*mixed, *[mixed[-1]] * (len(walls) - len(mixed))])
+            yield Side(j, mixed[0], 0.0, body.apart(free, sides))
+
+
+def varied(step: Step, way: Passing, s: FloatArray) -> list[FloatArray]:
+    """Paths that pass one polytope at one stage by another face than a way does."""
+    assert step.shapes is not None
+    walls = step.shapes.slots
+    body = Walls.of(step, s, walls, slice(0, len(way.path)))
+    return body.flips(way.path, way.touched[walls], step.nodes.count)
+
+
+def _elsewhere(
+    step: Step, free: FloatArray, present: FloatArray, conflict: BoolArray, j: int
+) -> FloatArray:
+    """The free plan, and the present one during all conflicts but the first with obstacle j."""
+    reach = _AROUND * step.nodes.count
+    others = conflict.copy()
+    others[j, _first_run(conflict[j], reach)] = False
+    points = np.flatnonzero(others.any(axis=0))
+    around = (points[:, None] + np.arange(-reach, reach + 1)).clip(0, len(free) - 1)
+    path = free.copy()
+    path[around] = present[around]
+    return path
+
+
+def same_way(step: Step, first: Passing, second: Passing) -> bool:
+    """Whether two plans are pushed by the same obstacles at the same stages on the same side."""
+    K = step.nodes.count
+    mine, theirs = (step.nodes.stages(p.touched).any(axis=2) for p in (first, second))
+    if not np.array_equal(mine, theirs):
+        return False
+    j, i = np.nonzero(mine)
+    i = K * (i + 1) - 1  # the samples of those stages
+    a, b = (_outward(step, passing.path, j, i) for passing in (first, second))
+    apart = (a * b).sum(axis=1) < _COSINE * np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    return not apart.any()
+
+
+def _outward(step: Step, path: FloatArray, j: IntArray, i: IntArray) -> FloatArray:
+    """Directions (K, d) in which points lie from their obstacles: of polytopes, the normals."""
+    y = path[i] - step.means[j, i + 1]
+    if step.shapes is not None:
+        shapes = step.shapes.taken(j)
+        k = shapes.slots
+        y[k] = shapes.taken(k).nearest(y[k, None]).normal[:, 0]
+    return y
+
+
+def _ways(
+    step: Step,
+    free: FloatArray,
+    elsewhere: FloatArray,
+    s: FloatArray,
+    j: int,
+    conflict: BoolArray,
+) -> Iterator[Side]:
+    K, around = step.nodes.count, _AROUND * step.nodes.count
+    points = _first_run(conflict, around)
+    v, normals = _directions(free - step.means[j, 1:], points, K)
+    reach = slice(max(points[0] - around, 0), points[-1] + around + 1)
+    body: Ellipsoids | Walls = Ellipsoids.of(step, float(s[j]), j, reach)
+    if step.shapes is not None and step.shapes.kind[j] >= 0:
+        body = Walls.of(step, s, np.array([j]), reach)
+        for n in body.faces(normals):
+            path = elsewhere.copy()
+            path[reach] = body.aside(free[reach], n)
+            yield Side(j, n, 0.0, path)
+    for time, push in WAYS:
+        for n in normals:
+            path = elsewhere.copy()
+            path[reach] = push(body, free[reach] + time * v, n)
+            yield Side(j, n, time, path)
+
+
+def _first_run(conflict: BoolArray, around: int) -> IntArray:
+    """Points of the first conflict; gaps shorter than its surroundings do not end it."""
+    points = np.flatnonzero(conflict)
+    gaps = np.flatnonzero(np.diff(points) > around)
+    return points[: gaps[0] + 1] if len(gaps) else points
+
+
+def _directions(
+    relative: FloatArray, points: IntArray, count: int
+) -> tuple[FloatArray, list[FloatArray]]:
+    begin, end = max(points[0] - count, 0), min(points[-1] + count, len(relative) - 1)
+    v = (relative[end] - relative[begin]) * (count / max(end - begin, 1))
+    if np.linalg.norm(v) <= _STILL * np.linalg.norm(relative[begin]):
+        v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
+    # The rows of the rotation that takes v onto the first axis: the others are square to it.
+    square = np.linalg.svd(v[None])[2][1:]
+    return v, [sign * n for n in square for sign in (1.0, -1.0)]

@@ -1,0 +1,105 @@
+"""Where the time of one control step goes, and whether what comes next still fits in."""
+
+from collections import Counter
+from math import inf
+from time import perf_counter
+
+_FORGET = 0.02  # of the difference to a shorter time, each time it is measured
+_LEAST = 1e-6  # [s] of any task
+_EASE = 0.98  # of a time, each time that it stood in the way: or one hiccup would do so for ever
+
+
+class Pace:
+    """How long tasks took lately: their longest times, slowly forgotten.
+
+    One serves all steps of a controller, so that the first iteration of a step is predicted from
+    those of earlier steps.
+    """
+
+    def __init__(self) -> None:
+        """Know nothing: everything is expected to take no time."""
+        self._seconds: dict[str, float] = {}
+
+    def expected(self, task: str) -> float:
+        """Predicted seconds."""
+        return self._seconds.get(task, 0.0)
+
+    def learn(self, task: str, seconds: float) -> None:
+        """Take note of a measured time."""
+        known = self.expected(task)
+        self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
+
+    def ease(self, task: str) -> None:
+        """Expect a little less, after a task was not begun."""
+        self._seconds[task] = _EASE * self.expected(task)
+
+
+class Clock:
+    """The time of one control step, and its deadline.
+
+    Args:
+        deadline: Seconds after which the step is late; None for never.
+        pace: Times of earlier steps.
+
+    Attributes:
+        spent: Seconds by what they were spent on: "linearise", "update" or "solve".
+    """
+
+    def __init__(self, deadline: float | None = None, pace: Pace | None = None) -> None:
+        """Begin the step."""
+        self._deadline = inf if deadline is None else deadline
+        self._pace = Pace() if pace is None else pace
+        self.spent: Counter[str] = Counter()
+        self._began = self._lap = perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the step began."""
+        return perf_counter() - self._began
+
+    @property
+    def remaining(self) -> float:
+        """Seconds until the deadline, negative after it; infinite without one."""
+        return self._deadline - self.elapsed
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether there is no deadline."""
+        return self._deadline == inf
+
+    def begin(self) -> None:
+        """Begin a lap."""
+        self._lap = perf_counter()
+
+    def charge(self, what: str) -> None:
+        """End a lap, book it on something, and begin the next one."""
+        now = perf_counter()
+        self.spent[what] += now - self._lap  # type: ignore[assignment]
+        self._lap = now
+
+    def allows(self, *tasks: str) -> bool:
+        """Whether some tasks, and what ends the step, are predicted to end before the deadline."""
+        if self._deadline == inf:
+            return True
+        ending = self._pace.expected("ending")
+        if sum(map(self._pace.expected, tasks)) + ending <= self.remaining:
+            return True
+        for task in tasks:
+            self._pace.ease(task)
+        return False
+
+    def room(self, task: str, most: int, then: str) -> int:
+        """How often, up to `most` times, a task fits in before another one, as predicted."""
+        if self._deadline == inf:
+            return most
+        after = self._pace.expected(then) + self._pace.expected("ending")
+        spare = self.remaining - after
+        times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
+        if times < most:
+            self._pace.ease(task)
+        return times
+
+    def learn(self, task: str, since: float, times: int = 1) -> None:
+        """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""
+        if self._deadline < inf and times:
+            self._pace.learn(task, (self.elapsed - since) / times)

@@ -1,0 +1,120 @@
+"""The last rungs of the ladder: what to do when the search has no plan that meets every constraint.
+
+1. the certified plan       2. a feasible iterate
+3. the last plan, shifted: its inputs from the state now, rechecked against the new predictions
+4. braking at the model's limits, checked likewise
+5. whatever violates least
+"""
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.problem import Problem
+from scp_mpc.robots.linear import LinearModel
+from scp_mpc.scp.plan import Result, Status
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.scp.step import Step
+
+_AT_REST = 1e-9  # of an input, in its own unit, that is none
+
+
+class Fallback:
+    """Plans that need no program.
+
+    Args:
+        problem: What they are judged by.
+        tolerance: Violation that is none [m].
+    """
+
+    def __init__(self, problem: Problem, tolerance: float) -> None:
+        """Find the response of a linear robot's states to the state now and to all inputs."""
+        self._problem, self._tolerance = problem, tolerance
+        self._response: FloatArray | None = None
+        if isinstance(problem.model, LinearModel):
+            self._respond(problem.model, problem.horizon)
+
+    def _respond(self, model: LinearModel, N: int) -> None:
+        powers = [np.eye(model.nx)]
+        response = np.zeros((N, model.nx, N, model.nu))
+        with np.errstate(over="ignore", invalid="ignore"):  # then nothing rolled out is judged safe
+            for k in range(N):
+                response[np.arange(k, N), :, np.arange(N - k)] = powers[-1] @ model.B
+                powers.append(model.A @ powers[-1])
+        self._drift = np.concatenate(powers[1:])
+        self._response = response.reshape(N * model.nx, N * model.nu)
+
+    def best(self, step: Step, last: Iterate | None) -> Result:
+        """The last plan, if it meets every constraint; else braking, whether it does or not."""
+        kept = None if last is None else self.keep(step, last.inputs)
+        return kept if kept is not None and kept.status.ok else self.brake(step)
+
+    def lesser(self, found: Result, braking: Result) -> Result:
+        """Of two plans with a violation, a certified one, else the one with less.
+
+        The largest slack and the largest excess of a state count at their prices.
+        """
+        if found.status.certified:
+            return found
+        return found if self._violation(found) <= self._violation(braking) else braking
+
+    def _violation(self, end: Result) -> float:
+        problem, iterate = self._problem, end.iterate
+        most = problem.slack_weight * float(iterate.slack.max(initial=0.0))
+        most += problem.state_slack_weight * float(problem.excess(iterate.states).max())
+        return np.inf if np.isnan(most) else most
+
+    def keep(self, step: Step, inputs: FloatArray) -> Result:
+        """Roll the last plan's inputs (N, nu) out from the state now."""
+        return self._judged(step, self._problem.limited(inputs, step.u_last), Status.PREVIOUS)
+
+    def brake(self, step: Step, status: Status = Status.BRAKING) -> Result:
+        """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
+        problem, model, x = self._problem, self._problem.model, step.x0
+        rest = np.clip(model.idle, problem.u_min, problem.u_max)
+        most, least = problem.u_max - rest, problem.u_min - rest
+        U, last = np.tile(rest, (problem.horizon, 1)), step.u_last
+        for u in U:
+            wanted = model.brake(x) - rest
+            if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
+                break
+            # As far as the bounds allow in the direction of what is wanted; inputs without any
+            # room stay where they are.
+            room = np.where(wanted > 0, most, least)
+            none = np.abs(room) <= _AT_REST
+            wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
+            u += wanted / max(1.0, float((wanted / room).max()))
+            u[:] = last = problem.limited(u[None], last)[0]
+            x = model.step(x, u)
+        return self._judged(step, problem.limited(U, step.u_last), status)
+
+    def _judged(self, step: Step, inputs: FloatArray, status: Status) -> Result:
+        """The trajectory of inputs with its true violation; FALLBACK where there is any."""
+        problem = self._problem
+        states = self._rolled_out(step.x0, inputs)
+        lost = ~np.isfinite(states).all(axis=1)
+        if lost.any():  # where the model has no next state, it stays in the last one
+            states[lost] = states[int(lost.argmax()) - 1]
+            status = Status.FALLBACK if status.ok else status
+        s = np.full(problem.max_obstacles, problem.size.reference)
+        s[: step.count] = problem.size.lower  # all that a plan without a search can promise
+        slack = np.zeros((problem.max_obstacles, step.nodes.size))
+        slack[: step.count] = step.depths(step.nodes.positions(states, inputs), s)
+        most = float(np.maximum(slack.max(initial=0.0), problem.excess(states).max()))  # or NaN
+        if status.ok and not most <= self._tolerance:
+            status = Status.FALLBACK
+        cost = problem.cost(states, inputs, s, step.x_ref)
+        merit = cost + problem.penalty(slack, states)
+        residuals = KKTResiduals(np.inf, most, np.inf)
+        return Result(Iterate(states, inputs, s, slack).frozen(), cost, merit, residuals, status, 0)
+
+    def _rolled_out(self, x0: FloatArray, inputs: FloatArray) -> FloatArray:
+        """States (N+1, nx) to which inputs lead."""
+        model = self._problem.model
+        if self._response is None:
+            states = [x0]
+            for u in inputs:
+                states.append(model.step(states[-1], u))
+            return np.array(states)
+        after = self._drift @ x0 + self._response @ inputs.ravel()
+        return np.concatenate([x0[None], after.reshape(-1, model.nx)])

@@ -1,0 +1,118 @@
+"""One iterate of the sequential convex programming, in the words of the problem.
+
+Notation:
+    X (N+1, nx)     states              s       (M,)    sizes of the ellipsoids
+    U (N, nu)       inputs              slack   (M, C)  violation per obstacle and node [m]
+    C               collision nodes: K in each of N intervals
+    nb              states with a finite bound, `Problem.bounded_states`
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scp_mpc.arrays import BoolArray, FloatArray
+from scp_mpc.robots.model import Model
+
+NEGLIGIBLE = 1e-6  # [cost / m, or per unit of input]; interior points leave none exactly zero
+
+
+@dataclass(frozen=True, eq=False)
+class Multipliers:
+    """Multipliers of the constraints: negative at lower, positive at upper bounds.
+
+    Attributes:
+        dynamics: (N, nx) of x_{i+1} - A x_i - B u_i = 0.
+        inputs: (N, nu) of the input bounds.
+        margin: (M,) of the bounds on s.
+        obstacles: (M, C) of the obstacles' constraints, never positive.
+        slack: (M, C) of slack = 0, or of slack >= 0 where it is free.
+        states: (N, nb) of the bounds of states, at most `Problem.state_slack_weight`; empty where
+            the problem has none, or where they are unknown.
+        rates: (N, nu) of the bounds of u_i - u_{i-1}; empty likewise.
+    """
+
+    dynamics: FloatArray
+    inputs: FloatArray
+    margin: FloatArray
+    obstacles: FloatArray
+    slack: FloatArray
+    states: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    rates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def shifted(self) -> "Multipliers":
+        """Move every stage one step earlier and repeat the last one."""
+        return Multipliers(
+            _shifted(self.dynamics, 0),
+            _shifted(self.inputs, 0),
+            self.margin,
+            _shifted(self.obstacles, 1, len(self.inputs)),
+            _shifted(self.slack, 1, len(self.inputs)),
+            _shifted(self.states, 0),
+            _shifted(self.rates, 0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """A primal-dual point. Without multipliers only the primal part is warm-started.
+
+    Attributes:
+        states: X.
+        inputs: U.
+        s: Sizes.
+        slack: Violations.
+        multipliers: Those of all constraints, or None.
+        free: (N, nu) inputs of the plan that ignores the obstacles; nonlinear robots' only.
+    """
+
+    states: FloatArray
+    inputs: FloatArray
+    s: FloatArray
+    slack: FloatArray
+    multipliers: Multipliers | None = None
+    free: FloatArray | None = None
+
+    @property
+    def touches(self) -> bool:
+        """Whether an obstacle may shape this point: an active constraint, or no multipliers."""
+        return self.multipliers is None or bool(self.touched.any())
+
+    @property
+    def touched(self) -> BoolArray:
+        """Which obstacles push this point, at which points: (M, C)."""
+        duals = self.multipliers
+        if duals is None:
+            return np.zeros(self.slack.shape, dtype=np.bool_)
+        touched: BoolArray = duals.obstacles < -NEGLIGIBLE
+        return touched
+
+    def frozen(self) -> "Iterate":
+        """Mark the arrays read-only: a plan shares them with the next step's guess."""
+        duals = () if self.multipliers is None else vars(self.multipliers).values()
+        for array in (self.states, self.inputs, self.s, self.slack, *duals):
+            array.setflags(write=False)
+        return self
+
+    def shifted(self, model: Model) -> "Iterate":
+        """Return the iterate one step later: the last input is held, its end state appended."""
+        last = model.step(self.states[-1], self.inputs[-1])
+        return Iterate(
+            np.concatenate([self.states[1:], last[None]]),
+            _shifted(self.inputs, 0),
+            self.s,
+            _shifted(self.slack, 1, len(self.inputs)),
+            None if self.multipliers is None else self.multipliers.shifted(),
+            None if self.free is None else _shifted(self.free, 0),
+        )
+
+
+def _shifted(values: FloatArray, axis: int, stages: int = 0) -> FloatArray:
+    """Drop the first stage along `axis` and repeat the last; a stage may have several entries."""
+    size = values.shape[axis]
+    if not size:
+        return values
+    count = size // stages if stages else 1
+    places = np.arange(size) + count
+    places[size - count :] -= count
+    return values.take(places, axis=axis)

@@ -1,0 +1,216 @@
+"""Multi-start: other ways past the obstacles against the plan that is there.
+
+All ways are ranked by one program each, solved to its active set or cut off where the multipliers
+prove that it cannot win; the best are followed to their end, and win if they are better by enough.
+Where the plan needs slack, all are followed until one does not.
+"""
+
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.scp.candidates import (
+    MAX_CANDIDATES,
+    MOST_AMONG_WALLS,
+    Passing,
+    candidates,
+    same_way,
+    varied,
+)
+from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.iterate import NEGLIGIBLE
+from scp_mpc.scp.loop import Loop
+from scp_mpc.scp.plan import Candidate, Result
+from scp_mpc.scp.transcription import Convex, Transcription
+
+# A rival must be better by this share, or the plan flickers between ways of equal cost.
+_HYSTERESIS = 0.001
+_HOPELESS = 3.0  # times the plan's own merit: more than that one program does not make good
+_BEAM = 3  # ways among polytopes that are varied
+_ROUNDS = 5  # of variations
+_ALIKE = 1e-6  # relative difference of merits that counts as none
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """What one program about a path leads to.
+
+    Attributes:
+        merit: Cost and penalty on the slack; infinite if there is no solution that can win.
+        passing: Its positions, and who pushes it where.
+        convex: The program with its solution; None if there is none.
+    """
+
+    merit: float
+    passing: Passing
+    convex: Convex | None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best plan so far, the ways that were tried, and whether one of them won."""
+
+    best: Result
+    tried: tuple[Candidate, ...] = ()
+    switched: bool = False
+
+
+class MultiStart:
+    """Tries other ways past the obstacles.
+
+    Args:
+        at: The control steps in numbers.
+        loop: Follows the ways that look best.
+    """
+
+    def __init__(self, at: Transcription, loop: Loop) -> None:
+        """Remember both."""
+        self._at, self._loop, self._settings = at, loop, at.settings
+
+    def wanted(self, best: Result, due: bool) -> bool:
+        """Whether to try: an obstacle is entered, or shapes a plan that is not safe or is due.
+
+        Not where no program was solved: there is no time, or no solver. Nor where no obstacle has
+        to do with what is wrong, as with a start outside the states' bounds.
+        """
+        if not self._settings.multi_start or best.nominal is None:
+            return False
+        clear = float(best.iterate.slack.max(initial=0.0)) <= self._settings.tolerance
+        return not clear or ((due or not best.status.ok) and best.iterate.touches)
+
+    def run(self, best: Result, free: FloatArray, fresh: bool = False) -> Found:
+        """Rank the ways past the obstacles by one program each; follow the best of them.
+
+        Among polytopes, a plan that is not `fresh` was searched for at the steps before: there are
+        no more candidates than elsewhere.
+
+        Args:
+            best: The plan that is there.
+            free: (C, d) positions of the plan that ignores the obstacles.
+            fresh: Whether there was none before.
+        """
+        at, step, clock = self._at, self._at.step, self._at.clock
+        assert best.nominal is not None
+        safe, nominal = best.status.ok, best.nominal
+        thorough = step.shapes is not None and (fresh or not safe)
+        most = clock.room(
+            "candidate", MOST_AMONG_WALLS if thorough else MAX_CANDIDATES, then="iteration"
+        )
+        if not most:
+            return Found(best)
+        began = clock.elapsed
+        here = Passing(at.path(nominal.y)[1:], best.iterate.touched[: step.count])
+        full = np.full(at.problem.max_obstacles, at.problem.size.reference)
+        ways = candidates(step, free, here.path, full, most)
+        ranked = self._rank(nominal, best, free, [way.path for way in ways])
+        clock.learn("candidate", began, len(ranked))
+        tried = tuple(
+            Candidate(way.obstacle, way.normal, way.time, one.merit)
+            for way, one in zip(ways, ranked, strict=False)  # fewer where time ran out
+        )
+        follow = self._settings.max_candidates
+        if thorough:
+            ranked = self._searched(nominal, best, free, ranked, full)
+            follow += _BEAM - 1  # some lead to where we are
+        goal, switched = best, False
+        ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
+        # A plan with slack is beaten by any without: then all ways are worth their time.
+        for one in ranked[:follow] if safe else ranked:
+            if one.convex is None:
+                break
+            if (not safe and goal.status.ok) or not clock.allows("iteration"):
+                break
+            if safe and same_way(step, one.passing, here):
+                continue  # this way leads to where we are
+            start = at.screened(at.reached(one.convex, one.convex.solution))
+            rival = self._loop.run(start, goal)
+            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = rival, True
+        return Found(goal, tried, switched)
+
+    def _rank(
+        self, nominal: Nominal, best: Result, free: FloatArray, paths: list[FloatArray]
+    ) -> list[Ranked]:
+        """Solve one program about each path (C, d), all linearised at once, until the deadline."""
+        at, c = self._at, self._at.layout
+        if not paths:
+            return []
+        safe = best.status.ok
+        full = np.full(at.problem.max_obstacles, at.problem.size.reference)
+        ys = np.repeat(nominal.y[None], len(paths), axis=0)
+        ys[:, c.s] = full
+        ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
+        known = np.zeros((at.step.count, at.nodes.size), dtype=np.bool_)
+        alone = nominal.y.copy()
+        alone[c.p] = (free - at.step.here).ravel()
+        near = at.near(alone, at.near(nominal.y, known))
+        from scp_mpc.scp.pairs import Pairs
+
+        nominal = at.renewed(nominal, Pairs(at.step, c, near))
+        condensed, give = at.condensed(nominal), at.relaxations(safe)[-1]
+        limit, found = _HOPELESS * best.merit if safe else inf, list[Ranked]()
+        for y, path, planes in zip(ys, paths, nominal.pairs.about(ys), strict=True):
+            if at.clock.remaining < 0:
+                break
+            qp = at.convex_qp(condensed, nominal.pairs, planes, give)
+            subproblem, rows = at.write(condensed, nominal.pairs, planes, give)
+            start = at.start(subproblem, nominal)
+            solution, _ = subproblem.solver.rank(qp, rows, start, limit)
+            if solution is None:
+                nobody = np.zeros(near.shape, dtype=np.bool_)
+                found.append(Ranked(inf, Passing(path, nobody), None))
+                continue
+            del y
+            merit, push = qp.merit(solution.v), solution.force[len(qp.F) :] > NEGLIGIBLE
+            there = at.path(condensed.y(solution.v))[1:]
+            convex = Convex(condensed, nominal.pairs, planes, qp, solution, give)
+            found.append(Ranked(merit, Passing(there, nominal.pairs.table(push)), convex))
+            if safe and self._settings.max_candidates == 1:
+                limit = min(limit, merit)
+        return found
+
+    def _searched(
+        self,
+        nominal: Nominal,
+        best: Result,
+        free: FloatArray,
+        ranked: list[Ranked],
+        full: FloatArray,
+    ) -> list[Ranked]:
+        """Among polytopes, which face to pass at which stage is a search: the best few ways of all.
+
+        Each is varied by one face at one stage, as long as that finds better ones.
+        """
+        clock, step = self._at.clock, self._at.step
+        beam, done = _best(ranked), list[Ranked]()
+        for _ in range(_ROUNDS):
+            paths = [
+                path
+                for way in beam
+                if not any(way is other for other in done)
+                for path in varied(step, way.passing, full)
+            ]
+            done += beam
+            most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
+            if not paths or not most:
+                break
+            began = clock.elapsed
+            more = self._rank(nominal, best, free, paths[:most])
+            clock.learn("candidate", began, len(more))
+            beam = _best([*beam, *more])
+        return beam or ranked
+
+
+def _best(ways: list[Ranked]) -> list[Ranked]:
+    """The best few that can be followed and differ in cost."""
+    beam: list[Ranked] = []
+    for way in sorted(ways, key=lambda way: way.merit):
+        alike = beam and way.merit - beam[-1].merit <= _ALIKE * way.merit
+        if len(beam) < _BEAM and np.isfinite(way.merit) and not alike:
+            beam.append(way)
+    return beam
+
+
+__all__ = ["Found", "MultiStart", "Ranked", "replace"]

@@ -1,0 +1,147 @@
+"""From a convex step to Newton's: the geometric series that the convex steps would add up to.
+
+The convex subproblem leaves out that half-spaces turn as the plan moves along a curved obstacle. A
+step d of it, with forces lambda, is followed by T d, then T^2 d and so on, where
+
+    T = (I - A'(A A')^-1 A) K,    K = sum_k lambda_k L_k L_k'
+
+maps a displacement to the one that the turned half-spaces cause, within the active set A. So the
+convex steps converge if and only if T contracts; then their sum is Newton's step on the original
+problem's KKT conditions,
+
+    (I - T)^-1 d = d + P L (I - L' P L)^-1 L' d,    P = I - A'(A A')^-1 A
+
+and I - L' P L is positive definite: the second-order condition. Where it is not, the convex steps
+lead away from this point, and there is nothing to sum.
+
+Where the dynamics bend, too, the second derivative of the Lagrangian is I + W with any symmetric W,
+and Newton's step goes on from the convex one within the null space of A: P (I + W) P z = -P W d.
+
+Notation:
+    d   (nv,)       step of the condensed problem
+    A   (k, nv)     responses of the active constraints
+    L   (q, nv)     responses of the bends, each times the root of its force
+    W   (nv, nv)    what the convex program leaves out; -L'L for a linear robot
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.qp.active_set import QPSolution, holds
+from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.transcription import Convex, Transcription
+
+_ROUNDING = 1e-9  # violation of a linearised constraint that is none
+_STRIDE = 4.0  # steps to look ahead where they lead away; its powers if they still do
+
+
+def refined(
+    at: Transcription, convex: Convex, leaps: int
+) -> tuple[QPSolution, FloatArray | None]:
+    """Go on from a convex step to Newton's, as far as its active set carries.
+
+    Args:
+        at: The control step.
+        convex: The subproblem, solved.
+        leaps: How often in a row the half-spaces were taken ahead of the plan.
+
+    Returns:
+        The refined solution, or the convex one; and, for a linear robot, the point (ny,) about
+        which to linearise next where that is not the solution. Empty where there is nothing to
+        refine.
+    """
+    solution, nf = convex.solution, len(convex.qp.F)
+    condensed = convex.condensed
+    if not at.linear:
+        W = at.curvature(convex, solution)
+        whole = newton_step(solution, solution.v - condensed.here, W)
+        if whole is not None and holds(convex.qp, whole, _ROUNDING):
+            return whole, None
+        return solution, None
+    bends, push, L = at.bends(convex, solution.force[nf:])
+    if not len(push):
+        return solution, None
+    reached = condensed.y(solution.v)
+    moved = reached - convex.planes.y
+    turned = np.einsum("kwm,kw->km", L, moved[convex.pairs.at[push]])
+    whole = summed(solution, bends, turned.ravel())
+    if whole is not None and holds(convex.qp, whole, _ROUNDING):
+        return whole, np.zeros(0)
+    if whole is None:
+        reached = reached + _STRIDE ** (leaps + 1) * moved
+    else:
+        reached = condensed.y(whole.v)
+    lower, upper = at.bounds
+    return solution, np.minimum(np.maximum(reached, lower), upper)
+
+
+def corrected(convex: Convex, solution: QPSolution, trial: Nominal) -> QPSolution:
+    """The second-order correction: the least change that takes the active pairs back to g = 0.
+
+    A step bends away from its linearised constraints by its square, which the merit would hold
+    against it wherever it is, also next to the optimum (Maratos, 1978).
+    """
+    nf = len(convex.qp.F)
+    pairs = solution.indices >= nf
+    if not pairs.any() or not np.isfinite(trial.cost):
+        return solution
+    rows, g = solution.rows, trial.pairs.table(trial.planes.g)
+    at = convex.pairs.obstacle, convex.pairs.node
+    wanted = np.zeros(len(rows))
+    wanted[pairs] = -g[at][solution.indices[pairs] - nf]
+    change, *_ = np.linalg.lstsq(rows, wanted)
+    return replace(solution, v=solution.v + change)
+
+
+def summed(solution: QPSolution, bends: FloatArray, step: FloatArray) -> QPSolution | None:
+    """Return the solution that the convex steps from this one on tend to; None if they do not.
+
+    Args:
+        solution: Of the convex subproblem.
+        bends: (q, nv) L, as above.
+        step: (q,) L' d: the convex step as the bends see it.
+    """
+    bent = np.eye(len(bends)) - bends @ bends.T
+    within = np.zeros((0, len(bends)))
+    if len(solution.indices):
+        across = solution.rows @ bends.T
+        within, _ = dpotrs(solution.factor, across)
+        bent += across.T @ within
+    _, turn, info = dposv(bent, step)
+    if info != 0:
+        return None
+    change = within @ turn
+    force = solution.force.copy()
+    force[solution.indices] -= change
+    v = solution.v + turn @ bends - change @ solution.rows
+    return replace(solution, v=v, force=force)
+
+
+def newton_step(solution: QPSolution, step: FloatArray, W: FloatArray) -> QPSolution | None:
+    """Return the solution to which Newton's step leads; None without the second-order condition.
+
+    Args:
+        solution: Of the convex subproblem.
+        step: (nv,) d, from the plan to it.
+        W: (nv, nv) as above.
+    """
+    M = W.copy()
+    M.flat[:: len(M) + 1] += 1.0
+    left = W @ step
+    if len(solution.indices):
+        R, _ = dtrtrs(solution.factor, solution.rows, trans=1)  # orthonormal rows that span A's
+        across = R @ M
+        M -= R.T @ across + across.T @ R - R.T @ (across @ R.T) @ R
+        M += R.T @ R
+        left = left - R.T @ (R @ left)
+    _, z, info = dposv(M, -left)
+    if info != 0:
+        return None
+    force = solution.force.copy()
+    if len(solution.indices):
+        change, _ = dpotrs(solution.factor, solution.rows @ (W @ (step + z)))
+        force[solution.indices] += change
+    return replace(solution, v=solution.v + z, force=force)

@@ -1,0 +1,325 @@
+"""The solver of one control step: puts the loop, its starts and what lies below it together.
+
+    free plan, which ignores the obstacles: if it is clear of them, nothing can be better
+    nominal = previous plan, shifted (or the free plan)
+    loop:       half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
+                residual of the original problem is below the tolerance, or the time is up
+    multi-start: where an obstacle shapes the plan, the same from paths on its other sides;
+                the best plan wins, if by enough
+    allocate:   where a joint risk is promised, give it to those who need it, and go on
+    fallback:   without a plan that meets every constraint, the previous one, or braking
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from threading import Lock
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.arrays import FloatArray, frozen
+from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.problem import Problem
+from scp_mpc.qp.program import QuadraticProgram
+from scp_mpc.scp.allocate import allocate
+from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.deadline import Clock, Pace
+from scp_mpc.scp.fallback import Fallback
+from scp_mpc.scp.guess import as_iterate
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.loop import Loop
+from scp_mpc.scp.multi_start import Found, MultiStart
+from scp_mpc.scp.nodes import Motion, Nodes
+from scp_mpc.scp.obstacle_free import obstacle_free
+from scp_mpc.scp.plan import Plan, Result, Status, Timing
+from scp_mpc.scp.step import Step
+from scp_mpc.scp.transcription import Relaxation, Transcription
+from scp_mpc.settings import Settings
+from scp_mpc.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+_CORRECTIONS = 4  # of what was assumed about the motion between nodes
+_WARM_UP = 3  # steps
+
+
+class SCP:
+    """Solves one control step at a time, without memory of the last plan.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+
+    Raises:
+        InvalidArgumentError: There is no solver of that name, or it is not installed.
+    """
+
+    def __init__(self, problem: Problem, settings: Settings | None = None) -> None:
+        """Condense the problem, lay the programs out and set the solvers up."""
+        self.problem = problem
+        self.settings = Settings() if settings is None else settings
+        if not isinstance(self.settings, Settings):
+            raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
+        self._busy, self._pace = Lock(), Pace()
+        self._nodes = Nodes.of(problem)
+        self._at = Transcription(problem, self.settings, self._nodes)
+        self._loop = Loop(self._at)
+        self._multi_start = MultiStart(self._at, self._loop)
+        self._fallback = Fallback(problem, self.settings.tolerance)
+        self._between = problem.nodes_per_interval > 1
+        if self.settings.deadline is not None:
+            self._warm_up()
+
+    def solve(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction] = (),
+        guess: Trajectory | Iterate | None = None,
+        multi_start: bool = True,
+        robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
+    ) -> Plan:
+        """Plan from the state x0 along the reference and around the obstacles.
+
+        Args:
+            x0: (nx,) state now.
+            x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
+            obstacles: At most `max_obstacles` predictions over the same horizon.
+            guess: Where to linearise first; None for the plan that ignores the obstacles.
+            multi_start: Try the other ways past the obstacles even if this one works, unless
+                `settings.multi_start` is off.
+            robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2]; adds to the
+                obstacles'.
+            u_last: (nu,) input last applied, from which the first rate counts. None for unknown:
+                then the first input has no rate.
+
+        Raises:
+            InvalidArgumentError: Or one of its subclasses, before anything is changed.
+            ConcurrentUseError: Another thread is using this solver.
+        """
+        nominal = None if guess is None else as_iterate(guess, self.problem)
+        return self.solve_from(
+            x0, x_ref, obstacles, nominal, multi_start, robot_covariance, u_last=u_last
+        )
+
+    def solve_from(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        nominal: Iterate | None,
+        multi_start: bool,
+        robot_covariance: ArrayLike | None = None,
+        clock: Clock | None = None,
+        u_last: ArrayLike | None = None,
+    ) -> Plan:
+        """`solve`, with an iterate that is known to fit, and a clock that may run."""
+        if not self._busy.acquire(blocking=False):
+            raise ConcurrentUseError("this solver is at work in another thread; give each its own")
+        try:
+            clock = self.clock() if clock is None else clock
+            step = Step.read(
+                self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
+            )
+            try:
+                return self._solve(step, clock, nominal, multi_start)
+            except (ArithmeticError, np.linalg.LinAlgError):
+                _log.exception("a computation broke down: the last plan, or braking")
+                return self._plan(step, Found(self._fallback.best(step, nominal)), clock)
+        finally:
+            self._busy.release()
+
+    def subproblem(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction] = (),
+        guess: Trajectory | Iterate | None = None,
+        elastic: bool = False,
+        robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
+    ) -> QuadraticProgram:
+        """Return the quadratic program that one SCP iteration solves, as sparse matrices.
+
+            minimise 1/2 z'P z + q'z   subject to   lower <= A z <= upper
+
+        Variables z are the states 1 .. N as deviations from the reference, the inputs 0 .. N-1, the
+        sizes if they move, and slack in an elastic program; rows are the dynamics, bounds, and
+        half-spaces about the guess. Its cost lacks a constant.
+
+        Args:
+            x0: As in `solve`, like the other arguments.
+            x_ref: Likewise.
+            obstacles: Likewise.
+            guess: The plan about which dynamics and obstacles are linearised.
+            elastic: Whether bounded states and half-spaces may yield, at their price.
+            robot_covariance: As in `solve`.
+            u_last: As in `solve`.
+        """
+        nominal = None if guess is None else as_iterate(guess, self.problem)
+        if not self._busy.acquire(blocking=False):
+            raise ConcurrentUseError("this solver is at work in another thread; give each its own")
+        try:
+            step = Step.read(
+                self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
+            )
+            at = self._at
+            at.begin(step, self.clock())
+            if nominal is None:
+                nominal = at.iterate(obstacle_free(at, self._loop, None))
+            about = at.at(nominal)
+            if self._between and step.count:
+                at.widen(self._widened(step, self._motion(nominal)))
+                about = at.at(nominal)
+            give = Relaxation.EVERYBODY if elastic else Relaxation.NOBODY
+            written, _ = at.write(at.condensed(about), about.pairs, about.planes, give)
+            return written.program.copy()
+        finally:
+            self._busy.release()
+
+    def brake(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        status: Status = Status.BRAKING,
+        u_last: ArrayLike | None = None,
+    ) -> Plan:
+        """Bring the robot to rest at the model's limits, whatever is in the way."""
+        clock = Clock()
+        step = Step.read(self.problem, x0, x_ref, (), nodes=self._nodes, u_last=u_last)
+        return self._plan(step, Found(self._fallback.brake(step, status)), clock)
+
+    def clock(self) -> Clock:
+        """The clock of a step that begins now."""
+        return Clock(self.settings.deadline, self._pace)
+
+    def _warm_up(self) -> None:
+        """Solve some steps with everybody in the way: first calls are slow, and paces unknown."""
+        problem, model = self.problem, self.problem.model
+        M, rows = problem.max_obstacles, problem.horizon + 1
+        fast, slow = np.zeros((2, rows, model.nx))
+        fast[:, model.position[0]] = np.linspace(0.0, 4.0 * problem.robot_radius * rows, rows)
+        slow[:, model.position[0]] = np.linspace(0.0, 4.0, rows)
+        for way in (fast, slow) * _WARM_UP:
+            means = np.zeros((M, rows, model.dim))
+            means[..., 0] = np.linspace(0.3, 0.9, M)[:, None] * way[-1, model.position[0]]
+            means[..., 1] = 0.1 * (-1.0) ** np.arange(M)[:, None]
+            self.solve(
+                way[0], way, [ObstaclePrediction(m, 0.01 * np.eye(model.dim), 0.1) for m in means]
+            )
+
+    def _solve(self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool) -> Plan:
+        at = self._at
+        at.begin(step, clock)
+        free = obstacle_free(at, self._loop, last)
+        free_motion, wide = None, step
+        if self._between and step.count:
+            free_motion = self._nodes.motion(*self._trajectory(free, step))
+            wide = self._widened(step, free_motion)
+        if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
+            at.widen(wide)
+            return self._plan(wide, Found(self._loop.result(free)), clock)
+        path = at.path(free.y)[1:]
+        start = at.iterate(free) if last is None else last
+        for _ in range(_CORRECTIONS):
+            assumed = None
+            if free_motion is not None:
+                assumed = self._motion(start).reserved(free_motion, self._nodes.most_deviation)
+                wide = self._widened(step, assumed)
+            at.widen(wide)
+            best = self._loop.run(at.at(start)) if step.count else None
+            found = Found(best or self._fallback.best(wide, last))
+            if self._multi_start.wanted(found.best, multi_start):
+                found = self._multi_start.run(found.best, path, last is None)
+            found = replace(found, best=allocate(at, self._loop, found.best))
+            ending = clock.elapsed
+            found = replace(found, best=self._rescued(wide, last, found.best))
+            if assumed is None or self._is_kept(step, assumed, found.best):
+                break
+            start = found.best.iterate
+        else:
+            found = replace(found, best=self._exposed(step, found.best))
+        plan = self._plan(wide, found, clock)
+        clock.learn("ending", ending)
+        return plan
+
+    def _rescued(self, step: Step, last: Iterate | None, best: Result) -> Result:
+        """Without a plan that meets every constraint: go on from one that does, if known."""
+        if best.status.ok or best.status is Status.FALLBACK:
+            return best
+        known = self._fallback.best(step, last)
+        if not known.status.ok:
+            return self._fallback.lesser(best, known)
+        better = self._loop.run(self._at.at(known.iterate))
+        return better if better and better.status.ok else known
+
+    def _is_clear(self, step: Step, plan: Nominal) -> bool:
+        path, s = self._at.path(plan.y), plan.y[self._at.layout.s]
+        return step.within(path, s, 0.0) is None
+
+    def _trajectory(self, plan: Nominal, step: Step) -> tuple[FloatArray, FloatArray]:
+        states = step.x_ref.copy()
+        states[0] = step.x0
+        states[1:] += plan.rollout.deviations
+        return states, plan.rollout.inputs
+
+    def _motion(self, iterate: Iterate) -> Motion:
+        return self._nodes.motion(iterate.states, iterate.inputs)
+
+    def _widened(self, step: Step, motion: Motion) -> Step:
+        """The step with radii that leave room for what happens between the nodes."""
+        return step.widened(self._nodes.radii(step.radii, step.drift, motion))
+
+    def _is_kept(self, step: Step, assumed: Motion, best: Result) -> bool:
+        """Whether a plan is clear between its nodes, too, for what it really does there."""
+        if not best.status.ok or assumed.covers(self._motion(best.iterate)):
+            return True
+        return bool(self._depths(step, best).max(initial=0.0) <= self.settings.tolerance)
+
+    def _depths(self, step: Step, best: Result) -> FloatArray:
+        """How deep a plan enters the no-go sets (J, C), for what it does between its nodes."""
+        iterate = best.iterate
+        path = self._nodes.positions(iterate.states, iterate.inputs)
+        return self._widened(step, self._motion(iterate)).depths(path, iterate.s)
+
+    def _exposed(self, step: Step, best: Result) -> Result:
+        """A plan that is not clear between its nodes after all, with how far it is not."""
+        depths, slack = self._depths(step, best), best.iterate.slack.copy()
+        slack[: step.count] = depths
+        iterate = replace(best.iterate, slack=slack).frozen()
+        residuals = replace(best.residuals, feasibility=float(depths.max()))
+        return replace(best, iterate=iterate, status=Status.VIOLATING, residuals=residuals)
+
+    def _plan(self, step: Step, found: Found, clock: Clock) -> Plan:
+        best = found.best
+        iterate = best.iterate
+        slack = iterate.slack[: step.count]
+        if step.nodes.count > 1:
+            slack = frozen(step.nodes.stages(slack).max(axis=2, initial=0.0))
+        finished = self._at.finished if best.nominal is not None or found.tried else {}
+        return Plan(
+            X=iterate.states,
+            U=iterate.inputs,
+            s=iterate.s[: step.count],
+            slack=slack,
+            x_slack=frozen(self.problem.excess(iterate.states)),
+            cost=best.cost,
+            status=best.status,
+            kkt=best.residuals,
+            iterations=best.iterations,
+            qps=dict(finished),
+            candidates=found.tried,
+            switched=found.switched,
+            timing=Timing(
+                linearise=clock.spent["linearise"],
+                update=clock.spent["update"],
+                solve=clock.spent["solve"],
+                total=clock.elapsed,
+            ),
+            iterate=iterate,
+            history=best.history,
+            step=step,
+        )

@@ -1,0 +1,272 @@
+"""What one control step brings, checked before the solver is touched.
+
+Notation:
+    J, M    obstacles of this step, slots for them
+    C       collision nodes, at which they are constrained: K in each interval
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.arrays import BoolArray, FloatArray, as_array, require_positive_semidefinite
+from scp_mpc.errors import ShapeError, TooManyObstaclesError
+from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
+from scp_mpc.problem import Problem
+from scp_mpc.safety.margin import Margin
+from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.safety.polytopes import Polytopes
+from scp_mpc.scp.nodes import Nodes
+
+_SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The validated state, reference and obstacles of one control step.
+
+    Attributes:
+        problem: The problem to which they belong.
+        x0: (nx,) state now.
+        x_ref: (N+1, nx) reference, row 0 not weighted.
+        obstacles: The J predictions.
+        nodes: Where the plan is constrained.
+        means: (J, C+1, d) expected positions, row 0 now [m].
+        radii: (J, C) sums of the radii, or more where gaps between points ask for it [m].
+        robot_covariance: (N+1, d, d) of the robot's own position [m^2], or None.
+        scale: (J, C) what multiplies the standard deviations: sizes over s_ref; or None for one.
+        u_last: (nu,) input last applied, from which the first rate counts; None for unknown.
+        shapes: Which obstacles are polytopes; None if all are round.
+    """
+
+    problem: Problem
+    x0: FloatArray
+    x_ref: FloatArray
+    obstacles: tuple[ObstaclePrediction, ...]
+    nodes: Nodes
+    means: FloatArray
+    radii: FloatArray
+    robot_covariance: FloatArray | None = None
+    scale: FloatArray | None = None
+    u_last: FloatArray | None = None
+    shapes: Polytopes | None = None
+
+    @classmethod
+    def read(
+        cls,
+        problem: Problem,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        robot_covariance: ArrayLike | None = None,
+        nodes: Nodes | None = None,
+        u_last: ArrayLike | None = None,
+    ) -> "Step":
+        """Check everything and stack the predictions, as they are at the samples.
+
+        Raises:
+            InvalidArgumentError: Or one of its subclasses, with the argument and the number.
+        """
+        model, N, M = problem.model, problem.horizon, problem.max_obstacles
+        state = as_array("x0", x0, (model.nx,))
+        reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
+        if reference.ndim == 1:
+            reference = np.tile(reference, (N + 1, 1))
+        obstacles = as_predictions(obstacles)
+        if len(obstacles) > M:
+            raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = {M}")
+        for j, obstacle in enumerate(obstacles):
+            if obstacle.means.shape != (N + 1, model.dim):
+                raise ShapeError(
+                    f"obstacles[{j}].means",
+                    f"shape {obstacle.means.shape} is not {(N + 1, model.dim)}",
+                )
+        uncertain = None
+        if robot_covariance is not None:
+            shape = (model.dim, model.dim)
+            uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
+            uncertain = np.broadcast_to(uncertain, (N + 1, *shape))
+            require_positive_semidefinite("robot_covariance", uncertain)
+        last = None if u_last is None else as_array("u_last", u_last, (model.nu,))
+        nodes = Nodes.of(problem) if nodes is None else nodes
+        means = np.array([o.means for o in obstacles]).reshape(-1, N + 1, model.dim)
+        radii = problem.robot_radius + np.array([o.radius for o in obstacles])
+        radii = np.repeat(radii[:, None], nodes.size, axis=1)
+        means = nodes.interpolated(means)
+        given = problem, state, reference, obstacles, nodes, means, radii, uncertain
+        step = cls(*given, u_last=last, shapes=Polytopes.of(obstacles))
+        return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
+
+    @property
+    def count(self) -> int:
+        """Number of obstacles J."""
+        return len(self.obstacles)
+
+    @cached_property
+    def covariances(self) -> FloatArray:
+        """(J, C+1, d, d) covariances that the sizes s apply to [m^2]."""
+        covariances = np.array([o.covariances for o in self.obstacles])
+        if self.robot_covariance is not None:
+            covariances = covariances + self.robot_covariance
+        covariances = self.nodes.interpolated(covariances)
+        if self.scale is not None:
+            covariances = covariances.copy()
+            covariances[:, 1:] *= (self.scale * self.scale)[..., None, None]
+        return covariances
+
+    @cached_property
+    def spreads(self) -> FloatArray:
+        """(J, C+1) bounds of the standard deviations in any direction [m]."""
+        spreads = np.array([o.spread for o in self.obstacles])
+        if self.robot_covariance is None and self.nodes.count == 1 and self.scale is None:
+            return spreads
+        variances = spreads * spreads
+        if self.robot_covariance is not None:
+            variances = variances + np.trace(self.robot_covariance, axis1=1, axis2=2)
+        spreads = np.sqrt(self.nodes.interpolated(variances))
+        if self.scale is not None:
+            spreads[:, 1:] *= self.scale
+        return spreads
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """Way of the obstacles between two instants (J, C) [m].
+
+        That of the mean, and three standard deviations of what the covariance grows by.
+        """
+        nodes, now = self.nodes, self.means[:, :1]
+        means = np.concatenate([now, self.means[:, nodes.discs :: nodes.discs]], axis=1)
+        variances = np.array([o.spread for o in self.obstacles]) ** 2
+        growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0))
+        growth = np.repeat(growth / nodes.instants, nodes.instants, axis=1)
+        length: FloatArray = np.sqrt(_squared(means[:, 1:] - means[:, :-1]))
+        return nodes.repeated(length + _SIGMAS * growth, axis=1)
+
+    @property
+    def here(self) -> FloatArray:
+        """(d,) the robot's position now: positions are counted from there, wherever that is."""
+        return self.x0[self.problem.model.position]
+
+    def path(self, away: FloatArray) -> FloatArray:
+        """Positions (C+1, d) [m] from now on, given those of the nodes (C d,) relative to now."""
+        here = self.here
+        path = np.empty((self.nodes.size + 1, len(here)))
+        path[0] = here
+        np.add(away.reshape(-1, len(here)), here, out=path[1:])
+        return path
+
+    def scaled_uniformly(self) -> "Step":
+        """The same with sizes as they are where all points are promised the same."""
+        size = self.problem.size_for(self.count, self.nodes.count)
+        scale = size / self.problem.size.reference
+        return replace(self, scale=None if scale == 1 else np.full(self.radii.shape, scale))
+
+    def widened(self, radii: FloatArray) -> "Step":
+        """The same with other radii (J, C); what does not depend on them is not computed again."""
+        wide = copy(self)
+        vars(wide)["radii"] = radii
+        return wide
+
+    def scaled(self, sizes: FloatArray) -> "Step":
+        """The same with sizes (J, C) of their own at all points."""
+        return replace(self, scale=sizes / self.problem.size.reference)
+
+    def unscaled(self) -> "Step":
+        """The same with covariances as they were predicted."""
+        return self if self.scale is None else replace(self, scale=None)
+
+    def within(
+        self,
+        positions: FloatArray,
+        s: FloatArray,
+        distance: float,
+        known: BoolArray | None = None,
+    ) -> BoolArray | None:
+        """Which obstacles may be nearer than a distance, (J, C) for nodes 1 .. C; None for none.
+
+        The direction n from the mean to p gives a lower bound of the signed distance to the
+        s-sigma ellipsoid, n'(p - mu) - s sqrt(n' Sigma n), and n' Sigma n is at most the largest
+        variance. Who is clear by these bounds is clear of either inflation's no-go set. Polytopes
+        are measured with the distance itself.
+
+        Args:
+            positions: (C+1, d) of the robot [m].
+            s: (M,) sizes of the ellipsoids.
+            distance: Beyond the radii [m].
+            known: (J, C) pairs that need no answer.
+        """
+        if not self.obstacles:
+            return None
+        near = self._within_ellipsoids(positions, s, distance, known)
+        if self.shapes is None:
+            return near
+        j = self.shapes.slots
+        room = self.shapes.taken(j).distance(positions[1:] - self.means[j, 1:]) - self.radii[j]
+        close = room <= s[j, None] * self.spreads[j, 1:] + distance
+        if known is not None:
+            close &= ~known[j]
+        near = np.zeros(self.radii.shape, dtype=np.bool_) if near is None else near
+        near[j] = close
+        return near if near.any() else None
+
+    def _within_ellipsoids(
+        self,
+        positions: FloatArray,
+        s: FloatArray,
+        distance: float,
+        known: BoolArray | None,
+    ) -> BoolArray | None:
+        """`within` for obstacles that are round."""
+        y = positions[1:] - self.means[:, 1:]
+        length2 = _squared(y)
+        reach = self.radii + distance
+        size = s[: self.count, None]
+        least = size * self.spreads[:, 1:] + reach
+        unclear = length2 <= least * least
+        if known is not None:
+            unclear &= ~known
+        if not unclear.any():
+            return None
+        y = y[unclear]
+        width2 = np.add.reduce(
+            (self.covariances[:, 1:][unclear] @ y[..., None])[..., 0] * y, axis=1
+        )
+        size, reach = (np.broadcast_to(v, unclear.shape)[unclear] for v in (size, reach))
+        length2 = length2[unclear]
+        close = length2 - size * np.sqrt(np.maximum(width2, 0.0)) <= reach * np.sqrt(length2)
+        if not close.any():
+            return None
+        unclear[unclear] = close
+        return unclear
+
+    def depths(self, path: FloatArray, s: FloatArray) -> FloatArray:
+        """How deep a path (C, d) enters the no-go sets at sizes s (M,): (J, C) [m]."""
+        now = self.x0[self.problem.model.position]
+        depths = np.zeros((self.count, len(path)))
+        near = self.within(np.concatenate([now[None], path]), s, 0.0)
+        if near is not None:
+            j, i = np.nonzero(near)
+            covariances = self.covariances[j, i + 1]
+            shapes = None if self.shapes is None else self.shapes.taken(j)
+            sets = NoGoSets.pairs(self.means[j, i + 1], covariances, self.radii[j, i], shapes)
+            before = path[i - 1] - self.means[j, i]
+            g = self.problem.no_go.linearise(sets, path[i][:, None], s[j], before).value
+            depths[j, i] = np.maximum(0.0, -g[:, 0])
+        return depths
+
+    def conflicts(self, path: FloatArray, s: FloatArray) -> BoolArray:
+        """Which no-go sets a path (C, d) enters at sizes s (M,): (J, C)."""
+        inside: BoolArray = self.depths(path, s) > 0
+        return inside
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    """Squared lengths (...) of many short vectors (..., d): component by component."""
+    total: FloatArray = vectors[..., 0] * vectors[..., 0]
+    for k in range(1, vectors.shape[-1]):
+        total += vectors[..., k] * vectors[..., k]
+    return total
