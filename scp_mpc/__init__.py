@@ -49,8 +49,8 @@ from scp_mpc.robots import (
     lqr_weight,
 )
 from scp_mpc.safety import Containment, JointRisk, Margin, StageRisk
-from scp_mpc.settings import Freshness, QPSettings, Settings
 from scp_mpc.scp import SCP, Iterate, Plan, Status
+from scp_mpc.settings import Freshness, QPSettings, Settings
 from scp_mpc.trajectory import Trajectory
 
 __version__ = version("scp-mpc")

@@ -18,15 +18,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model, require_round
+from scp_mpc.comparison.nlp import Unknowns, linear_model, read
 from scp_mpc.comparison.peer_plan import PeerMissingError, PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.ellipsoid import signed_distance
-from scp_mpc.solver.guess import as_iterate
+from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.scp.guess import as_iterate
 from scp_mpc.scp.iterate import Iterate
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory
 
 _SILENT = {
@@ -84,20 +85,19 @@ class Ipopt:
         """Plan from the state x0; arguments as for `SCP.solve`."""
         began = perf_counter()
         problem, unknowns = self.problem, self._unknowns
-        step = StepData.read(problem, x0, x_ref, obstacles)
-        require_round(step.obstacles)
+        step, sets = read(problem, x0, x_ref, obstacles)
         nominal = as_iterate(guess, problem)
         z, lower, upper = unknowns.pack(nominal), unknowns.lower, unknowns.upper
         if self._lifted:
             # Angles of inactive slots are fixed: IPOPT takes them out of the program.
-            theta, free = self._angles(step, nominal)
+            theta, free = self._angles(sets, nominal)
             z = np.concatenate([z, theta])
             lower, upper = np.append(lower, -free), np.append(upper, free)
-        outside = np.repeat(np.where(step.sets.active, 0.0, -np.inf), problem.horizon)
+        outside = np.repeat(np.where(sets.active, 0.0, -np.inf), problem.horizon)
         equal = np.zeros(problem.horizon * problem.model.nx)
         result = self._solver(
             x0=z,
-            p=parameters(step),
+            p=parameters(step, sets),
             lbx=lower,
             ubx=upper,
             lbg=np.concatenate([equal, outside]),
@@ -116,9 +116,8 @@ class Ipopt:
             message=str(stats["return_status"]),
         )
 
-    def _angles(self, step: StepData, nominal: Iterate) -> tuple[FloatArray, FloatArray]:
+    def _angles(self, sets: NoGoSets, nominal: Iterate) -> tuple[FloatArray, FloatArray]:
         """The maximising angles (M N,) at the guess, and infinity where they are free, else 0."""
-        sets = step.sets
         positions = nominal.states[1:, self.problem.model.position]
         y = sets.to_eigenframe(positions - sets.means)
         _, m = signed_distance(y, nominal.s[:, None, None] * sets.deviations)
@@ -142,9 +141,8 @@ def import_casadi() -> Any:
     return casadi
 
 
-def parameters(step: StepData) -> FloatArray:
+def parameters(step: Step, sets: NoGoSets) -> FloatArray:
     """All that changes from step to step, in a row: x0, x_ref, mu, R, sigma, r."""
-    sets = step.sets
     data = (step.x0, step.x_ref[1:], sets.means, sets.rotations, sets.deviations, sets.radii[:, 0])
     return np.concatenate([part.ravel() for part in data])
 

@@ -14,13 +14,16 @@ which each peer writes in the way that suits it.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel, as_linear
+from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.step import Step
 
 
 def linear_model(problem: Problem) -> LinearModel:
@@ -44,17 +47,11 @@ class Unknowns:
         upper: (size,) upper bounds, infinity for states.
 
     Raises:
-        InvalidArgumentError: The problem constrains points between the samples, or bounds states
-            or rates.
+        InvalidArgumentError: The problem has what `refuse_limits` refuses.
     """
 
     def __init__(self, problem: Problem) -> None:
         """Lay out z and its bounds."""
-        if problem.nodes_per_interval > 1:
-            raise InvalidArgumentError(
-                "problem.nodes_per_interval",
-                f"{problem.nodes_per_interval}, but peers constrain the samples only",
-            )
         refuse_limits(problem)
         N, nx, nu = problem.horizon, problem.model.nx, problem.model.nu
         self._shapes = (N, nx), (N, nu)
@@ -77,6 +74,24 @@ class Unknowns:
         return states, inputs.reshape(self._shapes[1]), s
 
 
+def read(
+    problem: Problem,
+    x0: ArrayLike,
+    x_ref: ArrayLike,
+    obstacles: Sequence[ObstaclePrediction],
+) -> tuple[Step, NoGoSets]:
+    """Check a control step, and stack its ellipsoids at all stages in all slots.
+
+    Raises:
+        InvalidArgumentError: Or one of its subclasses; also where an obstacle is a polytope.
+    """
+    step = Step.read(problem, x0, x_ref, obstacles)
+    require_round(step.obstacles)
+    covariances = step.covariances[:, 1:] if step.count else np.zeros(0)
+    slots = problem.max_obstacles
+    return step, NoGoSets.stacked(step.means[:, 1:], covariances, step.radii, slots)
+
+
 def require_round(obstacles: Sequence[ObstaclePrediction]) -> None:
     """Refuse obstacles that are polytopes: the peers' programs know ellipsoids only.
 
@@ -91,11 +106,16 @@ def require_round(obstacles: Sequence[ObstaclePrediction]) -> None:
 
 
 def refuse_limits(problem: Problem) -> None:
-    """Refuse bounds of states and of rates, which the peers' programs do not have.
+    """Refuse bounds of states and rates and nodes between samples: the peers' programs have none.
 
     Raises:
         InvalidArgumentError: There are some.
     """
+    if problem.nodes_per_interval > 1:
+        raise InvalidArgumentError(
+            "problem.nodes_per_interval",
+            f"{problem.nodes_per_interval}, but peers constrain the samples only",
+        )
     if problem.limits_states:
         at = int(problem.bounded_states[0])
         name = "x_max" if np.isfinite(problem.x_max[at]) else "x_min"

@@ -10,9 +10,9 @@ from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.settings import Settings
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.solver import SCP
+from scp_mpc.settings import Settings
 from scp_mpc.trajectory import Trajectory
 
 

@@ -12,7 +12,7 @@ from scp_mpc.errors import ScpMpcError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.scp.iterate import Iterate
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory
 
 
@@ -54,7 +54,7 @@ class PeerPlan:
     def judged(
         cls,
         problem: Problem,
-        step: StepData,
+        step: Step,
         obstacles: Sequence[ObstaclePrediction],
         point: tuple[FloatArray, FloatArray, FloatArray],
         *,

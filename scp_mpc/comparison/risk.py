@@ -43,6 +43,8 @@ from scp_mpc.comparison.risk_store import RiskStore
 from scp_mpc.comparison.risk_table import markdown
 from scp_mpc.comparison.timing_table import measured_on
 from scp_mpc.provenance import provenance
+from scp_mpc.scp.plan import Plan
+from scp_mpc.scp.solver import SCP
 from scp_mpc.simulation.contact import contacts, robot_path, sampled_contacts
 from scp_mpc.simulation.realisations import (
     COUPLINGS,
@@ -50,8 +52,6 @@ from scp_mpc.simulation.realisations import (
     applicable_couplings,
     sample_paths,
 )
-from scp_mpc.scp.plan import Plan
-from scp_mpc.scp.solver import SCP
 
 NAME = "risk"  # of the files
 SAMPLES = 100_000

@@ -17,10 +17,10 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.progress import progress
 from scp_mpc.control.mpc import MPC
+from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
-from scp_mpc.scp.plan import Plan
 
 HORIZONS = (5, 8, 15, 30, 60, 120, 200)
 OBSTACLES = (1, 2, 5, 12, 25, 50)

@@ -10,12 +10,12 @@ from scp_mpc.control.mpc import MPC
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel, as_linear
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.solver import SCP
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import Scenario
-from scp_mpc.scp.iterate import Iterate
-from scp_mpc.scp.solver import SCP
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike
 from scipy.optimize import Bounds, minimize
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model, require_round
+from scp_mpc.comparison.nlp import Unknowns, linear_model, read
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.solver.guess import as_iterate
+from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.scp.guess import as_iterate
 from scp_mpc.scp.iterate import Iterate
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory
 
 
@@ -53,15 +54,14 @@ class Slsqp:
         """Plan from the state x0; arguments as for `SCP.solve`."""
         began = perf_counter()
         problem, unknowns = self.problem, self._unknowns
-        step = StepData.read(problem, x0, x_ref, obstacles)
-        require_round(step.obstacles)
+        step, sets = read(problem, x0, x_ref, obstacles)
 
         def cost(z: FloatArray) -> float:
             return problem.cost(*unknowns.unpack(z, step.x0), step.x_ref)
 
         constraints: list[Any] = [{"type": "eq", "fun": lambda z: self._defects(z, step)}]
         if step.count:
-            constraints.append({"type": "ineq", "fun": lambda z: self._outside(z, step)})
+            constraints.append({"type": "ineq", "fun": lambda z: self._outside(z, step, sets)})
         with warnings.catch_warnings():
             # SLSQP may step out of the bounds by rounding, says so, and goes back.
             warnings.filterwarnings("ignore", "Values in x were outside bounds", RuntimeWarning)
@@ -83,18 +83,21 @@ class Slsqp:
             message=str(result.message),
         )
 
-    def _defects(self, z: FloatArray, step: StepData) -> FloatArray:
+    def _defects(self, z: FloatArray, step: Step) -> FloatArray:
         """x_{i+1} - A x_i - B u_i, (N nx,)."""
         X, U, _ = self._unknowns.unpack(z, step.x0)
         model = linear_model(self.problem)
         return (X[1:] - X[:-1] @ model.A.T - U @ model.B.T).ravel()
 
-    def _outside(self, z: FloatArray, step: StepData) -> FloatArray:
+    def _outside(self, z: FloatArray, step: Step, sets: NoGoSets) -> FloatArray:
         """The obstacles' g of `nlp.py`, (M N,) of the slots in use."""
         X, _, s = self._unknowns.unpack(z, step.x0)
-        sets = step.sets
+        positions = X[1:, self.problem.model.position]
         if self.problem.inflation == "exact":
-            return step.half_spaces(X, s).value[: step.count].ravel()
-        y = sets.to_eigenframe(X[1:, self.problem.model.position] - sets.means)
+            start = np.ones((len(s), positions.shape[1]))
+            start[: step.count] = step.here - step.means[:, 0]
+            value = self.problem.no_go.linearise(sets, positions, s, start).value
+            return value[: step.count].ravel()
+        y = sets.to_eigenframe(positions - sets.means)
         w = y / (s[:, None, None] * sets.deviations + sets.radii[..., None])
         return (np.square(w).sum(axis=-1) - 1)[: step.count].ravel()

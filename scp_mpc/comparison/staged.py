@@ -18,14 +18,13 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.ipopt import import_casadi, parameters
-from scp_mpc.comparison.nlp import linear_model, refuse_limits, require_round
+from scp_mpc.comparison.nlp import linear_model, read, refuse_limits
 from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.solver.guess import as_iterate
+from scp_mpc.scp.guess import as_iterate
 from scp_mpc.scp.iterate import Iterate
-from scp_mpc.solver.step_data import StepData
 from scp_mpc.trajectory import Trajectory
 
 _QUIET = {"print_time": False, "show_eval_warnings": False}
@@ -95,8 +94,7 @@ class Staged:
         began = perf_counter()
         problem = self.problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        step = StepData.read(problem, x0, x_ref, obstacles)
-        require_round(step.obstacles)
+        step, sets = read(problem, x0, x_ref, obstacles)
         nominal = as_iterate(guess, problem)
         sizes = np.broadcast_to(nominal.s, (N + 1, M))
         stages = np.concatenate([nominal.states, sizes], axis=1)
@@ -106,7 +104,7 @@ class Staged:
         lbg[np.flatnonzero(np.isinf(self._bounds["ubg"]))[unused]] = -np.inf
         result = self._solver(
             x0=np.concatenate([body.ravel(), stages[-1]]),
-            p=parameters(step),
+            p=parameters(step, sets),
             lbx=self._bounds["lbx"],
             ubx=self._bounds["ubx"],
             lbg=lbg,

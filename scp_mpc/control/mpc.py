@@ -20,12 +20,12 @@ from scp_mpc.control.memory import ObstacleMemory, Recall
 from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import ROUNDING, Problem
-from scp_mpc.settings import Settings
+from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
 from scp_mpc.scp.step import Step
-from scp_mpc.scp.deadline import Clock
+from scp_mpc.settings import Settings
 
 _log = logging.getLogger(__name__)
 

@@ -22,8 +22,8 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.disturbed import Disturbed
 from scp_mpc.robots.linear import as_linear
-from scp_mpc.settings import Settings
 from scp_mpc.scp.plan import Plan
+from scp_mpc.settings import Settings
 
 
 class WindAwareMPC:

@@ -206,7 +206,7 @@ def settled(
         depth, side = _violations(qp, solution)
         over = relieved = np.zeros(0)
         if qp.cap is not None:
-            over = np.where(capped, 0.0, np.abs(force) - qp.cap * (1 + 1e-9)) * (pull < 0)
+            over = np.where(capped | (pull >= 0), 0.0, np.abs(force) - qp.cap * (1 + 1e-9))
             relieved = np.where(capped, -depth, 0.0)
             depth = np.where(capped, 0.0, depth)
         worst_pull = pull.max(initial=0.0)

@@ -21,6 +21,7 @@ from scp_mpc.qp.others import PIQP, Named, installed, known
 from scp_mpc.qp.program import Backend, QuadraticProgram
 from scp_mpc.settings import QPSettings
 
+_GLANCES = 2  # runs of the solver after which a program is ranked
 _DIRECT = 2  # systems up to which the active set counts as the solver's own: one, and one repair
 
 
@@ -73,7 +74,8 @@ class ProgramSolver:
     Attributes:
         backend: The solver.
         finished: Programs by who finished them: the solver, "repaired" where its active set took
-            more than one repair, "piqp"; and "cut", given up because they cannot win.
+            more than one repair, "piqp". And programs that nobody finished: "ranked" by a bound,
+            "cut" because that is too high, "infeasible".
     """
 
     def __init__(
@@ -128,28 +130,33 @@ class ProgramSolver:
         return end[0]
 
     def rank(
-        self, qp: CondensedQP, rows: Rows, start: tuple[FloatArray, FloatArray], limit: float = inf
-    ) -> tuple[QPSolution | None, tuple[FloatArray, FloatArray]]:
-        """Solve with the first two stages alone, and stop where the optimum exceeds the limit.
+        self, qp: CondensedQP, rows: Rows, start: tuple[FloatArray, FloatArray], limit: float
+    ) -> tuple[float, tuple[FloatArray, FloatArray]]:
+        """Estimate the program's optimum from below, by the multipliers after a few iterations.
+
+        Args:
+            qp: As in `solve`, like the next two.
+            rows: Likewise.
+            start: Likewise.
+            limit: Optimum beyond which nobody cares: the second run is left out.
 
         Returns:
-            The solution, or None; and the point reached, to start from in the next control step.
+            A lower bound of the optimum, infinite where there is no solution or none within the
+            limit; and the point reached.
         """
         self.backend.load(start)
-        for effort, repairs in self.backend.stages[:2]:
+        bound = -inf
+        for effort, _ in self.backend.stages[:_GLANCES]:
             point = self.backend.run(effort)
             if point is None:
-                return None, start
-            start = point
-            if qp.dual_bound(rows.forces(point[1])) > limit:
-                self.finished["cut"] += 1
-                return None, start
-            end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
-            if end is not None:
-                self._count(self.backend.name, end[1])
-                return end[0], start
-        self.finished["cut"] += 1
-        return None, start
+                bound = inf
+                break
+            start, bound = point, qp.dual_bound(rows.forces(point[1]))
+            if bound > limit:
+                bound = inf
+                break
+        self.finished["cut" if bound == inf else "ranked"] += 1
+        return bound, start
 
     def _count(self, name: str, solves: int) -> None:
         self.finished[name if solves <= _DIRECT else "repaired"] += 1

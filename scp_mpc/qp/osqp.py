@@ -17,7 +17,11 @@ from scp_mpc.qp.program import Backend, QuadraticProgram
 from scp_mpc.settings import QPSettings
 
 _FAR = 1e3  # a bound that is none, in rows of length one: nearer than infinity, which costs more
-_POINTS = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
+_POINTS = (
+    osqp.SolverStatus.OSQP_SOLVED,
+    osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
+    osqp.SolverStatus.OSQP_MAX_ITER_REACHED,
+)
 
 
 class OSQP(Backend):
@@ -56,6 +60,8 @@ class OSQP(Backend):
             "adaptive_rho": 0,
             "check_termination": 0,
             "polishing": False,
+            "eps_prim_inf": 1e-15,  # there is a better test, and this one leaves no point behind
+            "eps_dual_inf": 1e-15,
             "max_iter": 1,
         }
         data, lower, upper_ = self._scaled()

@@ -12,8 +12,8 @@ from matplotlib.patches import Circle, Polygon
 from scp_mpc.arrays import FloatArray
 from scp_mpc.report.canvas import HALF_PLANE, OBSTACLE, PLAN, REFERENCE, ROBOT
 from scp_mpc.report.outline import no_go_outline
+from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.simulation.closed_loop import ClosedLoop
-from scp_mpc.solver.step_data import StepData
 
 _FADING = (1.0, 0.7, 0.5, 0.35, 0.2)  # opacity of the no-go sets along the horizon
 _HALF_LENGTH, _DEPTH = 1.2, 0.35  # [m] of a half-plane's edge and of its shading
@@ -83,18 +83,19 @@ def active_half_planes(run: ClosedLoop, k: int) -> list[FloatArray]:
     The first two corners lie on the edge, next to the planned position; the others on the
     forbidden side. Half-planes are about the plan itself, so that their edges touch it.
     """
-    plan, problem = run.plans[k], run.problem
+    plan = run.plans[k]
     if plan.multipliers is None:
         return []
-    step = StepData.read(problem, run.states[k], run.scenario.states(k), [run.predictions[k]])
-    spaces = step.half_spaces(plan.X, plan.iterate.s)
-    positions = plan.X[1:, problem.model.position]
-    residual = spaces.residual(positions, plan.iterate.s)[0]
+    step, i = plan.step, np.flatnonzero(plan.iterate.touched[0])
+    positions = step.nodes.positions(plan.X, plan.U)[i]
+    sets = NoGoSets.pairs(step.means[0, i + 1], step.covariances[0, i + 1], step.radii[0, i])
+    s, start = np.full(len(i), plan.iterate.s[0]), np.tile(step.here - step.means[0, 0], (len(i), 1))
+    spaces = run.problem.no_go.linearise(sets, positions[:, None], s, start)
     strips = []
-    for i in np.flatnonzero(np.abs(plan.multipliers.obstacles[0]) > run.settings.tolerance):
-        length = np.linalg.norm(spaces.normal[0, i])
-        n = spaces.normal[0, i] / length
-        foot = positions[i] - residual[i] / length * n
+    for p, normal, value in zip(positions, spaces.normal[:, 0], spaces.value[:, 0], strict=True):
+        length = np.linalg.norm(normal)
+        n = normal / length
+        foot = p - value / length * n
         along = _HALF_LENGTH * np.array([-n[1], n[0]])
         edge = np.stack([foot - along, foot + along])
         strips.append(np.concatenate([edge, edge[::-1] - _DEPTH * n]))

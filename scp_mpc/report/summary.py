@@ -13,9 +13,9 @@ from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.provenance import provenance
 from scp_mpc.report.encounters import slack_steps
 from scp_mpc.report.table import markdown_report
+from scp_mpc.scp.plan import Status
 from scp_mpc.simulation.closed_loop import ClosedLoop
 from scp_mpc.simulation.scenarios import DT
-from scp_mpc.scp.plan import Status
 
 
 def summarise(run: ClosedLoop) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class Loop:
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
         region, relaxation, history = Region(at), Relaxation.NOBODY, []
         best: Nominal | None = None
-        leaps, bold, iterations, began = 0, True, 0, clock.elapsed
+        leaps, bold, iterations, began = 0, about is None, 0, clock.elapsed
         while iterations < settings.max_iterations and clock.allows("iteration"):
             iterations += 1
             clock.begin()

@@ -5,7 +5,7 @@ prove that it cannot win; the best are followed to their end, and win if they ar
 Where the plan needs slack, all are followed until one does not.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 
 import numpy as np
@@ -22,8 +22,9 @@ from scp_mpc.scp.candidates import (
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.iterate import NEGLIGIBLE
 from scp_mpc.scp.loop import Loop
+from scp_mpc.scp.pairs import Pairs
 from scp_mpc.scp.plan import Candidate, Result
-from scp_mpc.scp.transcription import Convex, Transcription
+from scp_mpc.scp.transcription import Transcription
 
 # A rival must be better by this share, or the plan flickers between ways of equal cost.
 _HYSTERESIS = 0.001
@@ -35,17 +36,22 @@ _ALIKE = 1e-6  # relative difference of merits that counts as none
 
 @dataclass(frozen=True, eq=False)
 class Ranked:
-    """What one program about a path leads to.
+    """What one program about a path seems to lead to.
 
     Attributes:
-        merit: Cost and penalty on the slack; infinite if there is no solution that can win.
+        merit: Lower bound of its optimum, cost and penalty on the slack; infinite if it has no
+            solution, or none that can win.
         passing: Its positions, and who pushes it where.
-        convex: The program with its solution; None if there is none.
+        about: (ny,) the path, where its half-spaces are taken.
+        inputs: (N, nu) that it seems to lead to, with sizes (M,) and forces (nf + K,).
     """
 
     merit: float
     passing: Passing
-    convex: Convex | None
+    about: FloatArray
+    inputs: FloatArray
+    sizes: FloatArray
+    force: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,14 +124,13 @@ class MultiStart:
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
         # A plan with slack is beaten by any without: then all ways are worth their time.
         for one in ranked[:follow] if safe else ranked:
-            if one.convex is None:
+            if one.merit == inf:
                 break
             if (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
             if safe and same_way(step, one.passing, here):
                 continue  # this way leads to where we are
-            start = at.screened(at.reached(one.convex, one.convex.solution))
-            rival = self._loop.run(start, goal)
+            rival = self._loop.run(self._start(one), goal, one.about)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         return Found(goal, tried, switched)
@@ -146,30 +151,35 @@ class MultiStart:
         alone = nominal.y.copy()
         alone[c.p] = (free - at.step.here).ravel()
         near = at.near(alone, at.near(nominal.y, known))
-        from scp_mpc.scp.pairs import Pairs
-
         nominal = at.renewed(nominal, Pairs(at.step, c, near))
         condensed, give = at.condensed(nominal), at.relaxations(safe)[-1]
         limit, found = _HOPELESS * best.merit if safe else inf, list[Ranked]()
-        for y, path, planes in zip(ys, paths, nominal.pairs.about(ys), strict=True):
+        for path, about, planes in zip(paths, ys, nominal.pairs.about(ys), strict=True):
             if at.clock.remaining < 0:
                 break
             qp = at.convex_qp(condensed, nominal.pairs, planes, give)
             subproblem, rows = at.write(condensed, nominal.pairs, planes, give)
             start = at.start(subproblem, nominal)
-            solution, _ = subproblem.solver.rank(qp, rows, start, limit)
-            if solution is None:
-                nobody = np.zeros(near.shape, dtype=np.bool_)
-                found.append(Ranked(inf, Passing(path, nobody), None))
-                continue
-            del y
-            merit, push = qp.merit(solution.v), solution.force[len(qp.F) :] > NEGLIGIBLE
-            there = at.path(condensed.y(solution.v))[1:]
-            convex = Convex(condensed, nominal.pairs, planes, qp, solution, give)
-            found.append(Ranked(merit, Passing(there, nominal.pairs.table(push)), convex))
+            bound, (z, y) = subproblem.solver.rank(qp, rows, start, limit)
+            inputs, sizes = subproblem.plan(z, nominal.y[c.s])
+            force = rows.forces(y)
+            there = at.path(condensed.y(qp.unbox @ at.boxed(condensed, inputs, sizes)))[1:]
+            push = nominal.pairs.table(force[len(qp.F) :] > NEGLIGIBLE)
+            passing = Passing(path if bound == inf else there, push)
+            found.append(Ranked(bound, passing, about, inputs, sizes, force))
             if safe and self._settings.max_candidates == 1:
-                limit = min(limit, merit)
+                limit = min(limit, bound)
+        self._pairs = nominal.pairs
         return found
+
+    def _start(self, one: Ranked) -> Nominal:
+        """The plan of a way's inputs, with its multipliers."""
+        at, pairs = self._at, self._pairs
+        y, rollout = at.rolled(one.inputs, one.sizes)
+        nf = len(one.force) - len(pairs.node)
+        none = np.zeros(len(pairs.node), dtype=np.bool_)
+        plan = at.certify(y, rollout, one.force[:nf], pairs, one.force[nf:], none)
+        return at.screened(plan)
 
     def _searched(
         self,
@@ -212,5 +222,3 @@ def _best(ways: list[Ranked]) -> list[Ranked]:
             beam.append(way)
     return beam
 
-
-__all__ = ["Found", "MultiStart", "Ranked", "replace"]

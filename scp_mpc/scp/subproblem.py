@@ -201,6 +201,12 @@ class Subproblem:
             y[self._pins] = pins
         return z, y
 
+    def plan(self, z: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inputs (N, nu) and sizes (M,) in z; `s` holds those that do not move."""
+        sizes = s.copy()
+        sizes[: self._layout.moving] = z[self._s]
+        return z[self._u].reshape(self._layout.shape), sizes
+
     def shifted(self, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
         """A start one control step later: every stage moves up, the last one stays."""
         if not hasattr(self, "_shift"):

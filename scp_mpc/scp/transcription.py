@@ -425,6 +425,12 @@ class Transcription:
             upper[c.inputs] = np.minimum(upper[c.inputs], u + radius)
         return lower, upper
 
+    def boxed(self, condensed: Condensed, inputs: FloatArray, s: FloatArray) -> FloatArray:
+        """Sizes and inputs (nv,) relative to those of the plan that nothing constrains."""
+        c = self.layout
+        both = np.concatenate([s[: c.moving], inputs.ravel()])
+        return both - condensed.y_free[c.boxed][: c.variables]
+
     def _cap(self, pairs: int, relaxation: Relaxation) -> FloatArray | None:
         """Largest forces (nf + K,) on a program's constraints; None for firm ones."""
         if relaxation is Relaxation.NOBODY:

@@ -14,10 +14,10 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import as_linear
 from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import DT, STEPS, Scenario
-from scp_mpc.scp.plan import Plan
 
 
 class Controller(Protocol):

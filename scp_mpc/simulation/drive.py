@@ -21,9 +21,9 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.robots.model import Model
 from scp_mpc.safety.polytopes import Polytopes
+from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.contact import FINE
-from scp_mpc.scp.plan import Plan
 
 Look = Callable[[int, FloatArray], tuple[FloatArray, list[ObstaclePrediction]]]
 
