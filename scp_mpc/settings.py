@@ -12,7 +12,8 @@ class QPSettings:
     """OSQP's settings, and what follows where it does not name the active set.
 
     Attributes:
-        rho: OSQP's step size, for rows of length one; anything from 10 to 30 does.
+        rho: OSQP's step sizes, for rows of length one, from one run to the next: what is hard for
+            one of them is often easy for another.
         sigma: OSQP's regularisation.
         alpha: OSQP's relaxation, between 0 and 2.
         iterations: ADMM iterations to run, one after the other, until the active set is found.
@@ -20,17 +21,21 @@ class QPSettings:
         rescue: Whether to ask PIQP for what is not solved then.
     """
 
-    rho: float = 10.0
+    rho: tuple[float, ...] = (10.0, 1.0, 100.0, 1.0, 100.0)
     sigma: float = 1e-6
     alpha: float = 1.6
-    iterations: tuple[int, ...] = (10, 15, 25, 50, 100)
-    repairs: tuple[int, ...] = (1, 1, 3, 3, 7)
+    iterations: tuple[int, ...] = (10, 25, 25, 50, 50)
+    repairs: tuple[int, ...] = (1, 1, 1, 3, 7)
     rescue: bool = True
 
     def __post_init__(self) -> None:
         """Check every number, because OSQP does not."""
-        for name in ("rho", "sigma", "alpha"):
+        for name in ("sigma", "alpha"):
             require_positive(f"qp.{name}", getattr(self, name))
+        if not isinstance(self.rho, tuple) or not self.rho:
+            raise InvalidArgumentError("qp.rho", f"{self.rho!r} is not a tuple of numbers")
+        for rho in self.rho:
+            require_positive("qp.rho", rho)
         if self.alpha >= 2:
             raise BoundsError("qp.alpha", f"{self.alpha} is not below 2")
         for name, least in (("iterations", 1), ("repairs", 0)):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.progress import progress
 from scp_mpc.comparison.sequence import record
 from scp_mpc.errors import InvalidArgumentError
@@ -37,14 +38,13 @@ def recorded(steps: int) -> list[QuadraticProgram]:
     return found
 
 
-def rows(steps: int, every: int = 2) -> list[dict[str, Any]]:
-    """Solve every k-th program with every solver; a missing solver keeps its row.
+def rows(steps: int) -> list[dict[str, Any]]:
+    """Solve all programs with every solver; a missing solver keeps its row.
 
     Args:
         steps: Control steps of the closed loop.
-        every: k.
     """
-    programs = recorded(steps)[::every]
+    programs = recorded(steps)
     with progress(len(SOLVERS) * len(programs)) as advance:
         return [_row(name, programs, advance) for name in SOLVERS]
 
@@ -52,8 +52,8 @@ def rows(steps: int, every: int = 2) -> list[dict[str, Any]]:
 def markdown(table: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown."""
     head = (
-        "| QP solver | Programs | Solved to 1e-6 | No point | Median [ms] | p99 [ms] "
-        "| Max [ms] |\n|:--|--:|--:|--:|--:|--:|--:|"
+        "| QP solver | Programs | Solved to 1e-6 | No point | Median residual | Median [ms] "
+        "| p99 [ms] | Max [ms] |\n|:--|--:|--:|--:|--:|--:|--:|--:|"
     )
     return "\n".join([head, *map(_line, table)])
 
@@ -62,23 +62,28 @@ def _row(
     name: str, programs: Sequence[QuadraticProgram], advance: Callable[[], object]
 ) -> dict[str, Any]:
     row: dict[str, Any] = {"solver": name, "programs": len(programs)}
-    times, solved, none = [], 0, 0
+    times, worst = [], []
     for program in programs:
         began = perf_counter()
         try:
             point = _solved(name, program)
         except InvalidArgumentError:
-            return row | {"solved": None, "none": None, "ms": None}
+            return row | {"solved": None, "none": None, "residual": None, "ms": None}
         times.append(1e3 * (perf_counter() - began))
-        none += point is None
-        solved += point is not None and program.residuals(*point).worst <= ACCURACY
+        if point is not None:
+            worst.append(program.residuals(*point).worst)
         advance()
-    quantiles = np.percentile(times, [50, 99, 100]).tolist()
-    return row | {"solved": solved, "none": none, "ms": quantiles}
+    return row | {
+        "solved": sum(residual <= ACCURACY for residual in worst),
+        "none": len(programs) - len(worst),
+        "residual": float(np.median(worst)) if worst else None,
+        "ms": np.percentile(times, [50, 99, 100]).tolist(),
+    }
 
 
-def _solved(name: str, program: QuadraticProgram) -> Any:
+def _solved(name: str, program: QuadraticProgram) -> tuple[FloatArray, FloatArray] | None:
     """A solver's point and multipliers from zero, or None."""
+    point = None
     solver = backend(program, np.flatnonzero(program.lower == program.upper), name, QPSettings())
     solver.load((np.zeros(len(program.q)), np.zeros(len(program.lower))))
     if name != "osqp":
@@ -92,6 +97,7 @@ def _solved(name: str, program: QuadraticProgram) -> Any:
 
 def _line(row: dict[str, Any]) -> str:
     if row["ms"] is None:
-        return f"| {row['solver']} | {row['programs']} | not installed | | | | |"
-    times = " | ".join(f"{v:.2f}" for v in row["ms"])
-    return f"| {row['solver']} | {row['programs']} | {row['solved']} | {row['none']} | {times} |"
+        return f"| {row['solver']} | {row['programs']} | not installed | | | | | |"
+    cells = [row["solver"], row["programs"], row["solved"], row["none"]]
+    cells.append("" if row["residual"] is None else f"{row['residual']:.0e}")
+    return "| " + " | ".join([*map(str, cells), *(f"{v:.2f}" for v in row["ms"])]) + " |"

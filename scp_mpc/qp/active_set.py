@@ -20,14 +20,17 @@ Notation:
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.lapack import dposv, dpotrs, dpstrf
+from scipy.linalg import qr, solve_triangular
+from scipy.linalg.lapack import dposv
+from scipy.optimize import nnls
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 
 _ACCURACY = 1e-9  # of a constraint, in its own unit
 _SHARE = 0.5  # of the worst: who is no better goes along
 _PULL = 1e-10  # of the largest force: a force the wrong way that is none
-_DEPENDENT = 1e-11  # of the largest pivot
+_POOR = 1e-4  # of the largest pivot: too little for a factor of the squares to be exact
+_DEPENDENT = 1e-10  # of the largest pivot: none
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,14 +169,15 @@ def solve_on(qp: CondensedQP, active: IntArray, capped: BoolArray) -> QPSolution
     at = np.where(active[bounds] < 0, qp.lower[bounds], qp.upper[bounds])
     wanted = np.concatenate([at, qp.b[spaces]]) - rows @ v
     factor, strength, info = dposv(rows @ rows.T, wanted)
-    if info != 0 or _near_dependent(factor):
-        keep = _independent(rows)
-        indices, rows, wanted = indices[keep], rows[keep], wanted[keep]
-        factor, strength, _ = dposv(rows @ rows.T, wanted)
+    if info != 0 or _ill_conditioned(factor):
+        keep, factor, strength, v_rows = _independent(rows, wanted, -active[indices])
         active = active.copy()
-        active[np.setdiff1d(active.nonzero()[0], np.append(indices, capped.nonzero()[0]))] = 0
+        active[np.delete(indices, keep)] = 0
+        indices, rows = indices[keep], rows[keep]
+    else:
+        v_rows = strength @ rows
     force[indices] = strength
-    return QPSolution(v + strength @ rows, force, active, capped, rows, indices, factor)
+    return QPSolution(v + v_rows, force, active, capped, rows, indices, factor)
 
 
 def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -> bool:
@@ -238,19 +242,34 @@ def _violations(qp: CondensedQP, solution: QPSolution) -> tuple[FloatArray, IntA
     return depth, side
 
 
-def _near_dependent(factor: FloatArray) -> bool:
+def _ill_conditioned(factor: FloatArray) -> bool:
     pivots = factor.diagonal()
-    return bool(pivots.min() <= np.sqrt(_DEPENDENT) * pivots.max())
+    return bool(pivots.min() <= _POOR * pivots.max())
 
 
-def _independent(rows: FloatArray) -> IntArray:
-    """Indices of a largest set of rows that do not depend on each other: pivoted Cholesky."""
-    gram = rows @ rows.T
-    _, pivots, rank, _ = dpstrf(gram, tol=_DEPENDENT * float(gram.diagonal().max()))
-    return np.sort(pivots[:rank] - 1)
+def _independent(
+    rows: FloatArray, wanted: FloatArray, sign: IntArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Solve with a largest set of rows that do not depend on each other, without squaring them.
 
+    At a degenerate vertex many sets lead to the same point, but not all of them with forces that
+    push; non-negative least squares find one that does.
 
-def solved_with(factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Apply the inverse of rows rows' by its factor."""
-    solution: FloatArray = dpotrs(factor, right)[0]
-    return solution
+    Returns:
+        Which rows (k,); the factor (k, k) of rows rows'; their forces; and the point that they
+        demand (nv,).
+    """
+    Q, R, order = qr(rows.T, mode="economic", pivoting=True)
+    pivots = np.abs(R.diagonal())
+    rank = int(np.count_nonzero(pivots > _DEPENDENT * pivots[0]))
+    along = solve_triangular(R[:rank, :rank], wanted[order[:rank]], trans=1)
+    point = Q[:, :rank] @ along
+    if rank == len(rows):
+        return order, R, solve_triangular(R, along), point
+    force, missed = nnls((rows * sign[:, None]).T, point, maxiter=30 * len(rows))
+    keep = np.flatnonzero(force)
+    if missed > _ACCURACY * max(1.0, float(np.linalg.norm(point))) or not len(keep):
+        keep = order[:rank]
+        force[keep] = sign[keep] * solve_triangular(R[:rank, :rank], along)
+    R = qr(rows[keep].T, mode="r")[0][: len(keep)]
+    return keep, R, sign[keep] * force[keep], point

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.errors import BoundsError, NotFiniteError
-from scp_mpc.qp.program import Backend, QuadraticProgram
+from scp_mpc.qp.program import Backend, QuadraticProgram, bounded
 from scp_mpc.settings import QPSettings
 
 _FAR = 1e3  # a bound that is none, in rows of length one: nearer than infinity, which costs more
@@ -41,6 +41,7 @@ class OSQP(Backend):
     def __init__(self, program: QuadraticProgram, settings: QPSettings) -> None:
         """Set OSQP up on scaled copies."""
         self._program, self.stages = program, settings.stages
+        self._steps, self._runs = settings.rho, 0
         diagonal = program.P.diagonal()
         self._columns = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         row, column = program.P.indices, _column_of(program.P)
@@ -54,7 +55,7 @@ class OSQP(Backend):
         self._settings = {
             "verbose": False,
             "scaling": 0,
-            "rho": settings.rho,
+            "rho": settings.rho[0],
             "sigma": settings.sigma,
             "alpha": settings.alpha,
             "adaptive_rho": 0,
@@ -78,6 +79,8 @@ class OSQP(Backend):
         data, lower, upper = self._scaled()
         q = self._columns * program.q
         _check(q, data, lower, upper)
+        if self._runs > 1:
+            solver.update_settings(rho=self._steps[0])
         values = {"q": q, "l": lower, "u": upper, "Ax": data}
         if not np.array_equal(program.P.data, self._known):
             self._known = program.P.data.copy()
@@ -87,10 +90,14 @@ class OSQP(Backend):
         _check(x, y)
         solver.warm_start(x=x, y=y)
         self.iterations = 0
+        self._runs = 0
 
     def run(self, effort: int) -> tuple[FloatArray, FloatArray] | None:
         """See the base class; effort counts ADMM iterations."""
         solver = self._solver
+        if self._runs:
+            solver.update_settings(rho=self._steps[min(self._runs, len(self._steps) - 1)])
+        self._runs += 1
         solver.update_settings(max_iter=effort)
         result = solver.solve(raise_error=False)
         self.iterations += effort
@@ -106,8 +113,7 @@ class OSQP(Backend):
         length2 = np.bincount(self._row, data * data, self._m)
         self._rows = 1.0 / np.sqrt(np.where(length2 > 0, length2, 1.0))
         data *= self._rows[self._row]
-        lower = np.maximum(self._rows * program.lower, -_FAR)
-        return data, lower, np.minimum(self._rows * program.upper, _FAR)
+        return data, *bounded(self._rows * program.lower, self._rows * program.upper, _FAR)
 
 
 def _column_of(matrix: sparse.csc_matrix) -> IntArray:

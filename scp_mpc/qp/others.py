@@ -17,9 +17,10 @@ import qpsolvers
 from scipy import sparse
 
 from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.qp.program import Backend, QuadraticProgram
+from scp_mpc.qp.program import Backend, QuadraticProgram, bounded
 
-_PRECISION = 1e-12
+_PRECISION = 1e-10
+_POINTS = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)  # the exact solve tells good from bad
 _FAR = 1e3  # a bound that is none: PIQP prints about infinite ones
 
 
@@ -59,13 +60,12 @@ class PIQP(Backend):
             self._equations,
             program.lower[e],
             self._inequalities,
-            np.maximum(program.lower[i], -_FAR),
-            np.minimum(program.upper[i], _FAR),
+            *bounded(program.lower[i], program.upper[i], _FAR),
         )
 
     def run(self, effort: int) -> tuple[FloatArray, FloatArray] | None:  # noqa: ARG002
         """See the base class."""
-        if self._solver.solve() != piqp.PIQP_SOLVED:
+        if self._solver.solve() not in _POINTS:
             return None
         result, y = self._solver.result, np.empty(len(self._program.lower))
         y[self._e], y[self._i] = result.y, result.z_u - result.z_l

@@ -78,6 +78,15 @@ class QuadraticProgram:
         return KKTResiduals(float(gradient), max(0.0, float(violation)), float(product))
 
 
+def bounded(
+    lower: FloatArray, upper: FloatArray, far: float
+) -> tuple[FloatArray, FloatArray]:
+    """Bounds (m,) with finite ones, that far from the other side, for those that are none."""
+    none, nothing = lower == -inf, upper == inf
+    most = np.where(nothing, np.where(none, 0.0, lower) + far, upper)
+    return np.where(none, np.where(nothing, 0.0, upper) - far, lower), most
+
+
 class Backend(ABC):
     """Solves programs of one pattern, again and again.
 

@@ -6,6 +6,7 @@ from scp_mpc.report.coverage_figure import coverage_figure
 from scp_mpc.report.coverage_table import coverage_numbers, coverage_table
 from scp_mpc.report.exhibits import Exhibit, exhibits
 from scp_mpc.report.figures import FIGURES, write_figures
+from scp_mpc.report.history_figure import history_figure
 from scp_mpc.report.replay_animation import write_replay_animation
 from scp_mpc.report.replay_figure import replay_figure
 from scp_mpc.report.replay_summary import replay_table, summarise_replay
@@ -20,6 +21,7 @@ __all__ = [
     "coverage_numbers",
     "coverage_table",
     "exhibits",
+    "history_figure",
     "markdown_table",
     "replay_figure",
     "replay_table",

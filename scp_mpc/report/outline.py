@@ -10,6 +10,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.solid import Solid
 from scp_mpc.problem import Problem
 from scp_mpc.safety.no_go import NoGoSets
 
@@ -20,13 +21,6 @@ def no_go_outline(
     problem: Problem, prediction: ObstaclePrediction, stage: int, s: float
 ) -> FloatArray:
     """Return a closed polygon (K, 2) [m] around the no-go set of a stage, 0 being now.
-
-    With the exact inflation, the boundary of ellipse (+) disc is sampled by its normals,
-
-        mu + s Sigma n / sqrt(n' Sigma n) + r n;
-
-    with the axes' inflation it is the ellipse with semi-axes s sigma_l + r. Around a polygon it is
-    the corner that lies farthest along n, plus (s sigma_max + r) n.
 
     Raises:
         ValueError: The prediction is not planar.
@@ -40,14 +34,30 @@ def no_go_outline(
             [prediction], problem.robot_radius, 1, prediction.horizon, 2
         )
     at = max(stage - 1, 0)
-    mean, rotation, sigma = sets.means[0, at], sets.rotations[0, at], sets.deviations[0, at]
-    r = sets.radii[0, at]
+    return outline(sets, (0, at), s, problem.inflation, prediction.shape)
+
+
+def outline(
+    sets: NoGoSets, at: tuple[int, int], s: float, inflation: str, shape: Solid | None = None
+) -> FloatArray:
+    """Return a closed polygon (K, 2) [m] around one of the sets, `at` (slot, stage).
+
+    With the exact inflation, the boundary of ellipse (+) disc is sampled by its normals,
+
+        mu + s Sigma n / sqrt(n' Sigma n) + r n;
+
+    with the axes' inflation it is the ellipse with semi-axes s sigma_l + r. Around a polygon it is
+    the corner that lies farthest along n, plus (s sigma_max + r) n.
+    """
+    mean, rotation, sigma, r = (
+        part[at] for part in (sets.means, sets.rotations, sets.deviations, sets.radii)
+    )
     angle = np.linspace(0.0, 2 * np.pi, _POINTS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    if prediction.shape is not None:
-        corners = prediction.shape.vertices
+    if shape is not None:
+        corners = shape.vertices
         return mean + corners[(n @ corners.T).argmax(axis=1)] + (s * sigma.max() + r) * n
-    if problem.inflation == "axes":
+    if inflation == "axes":
         return mean + ((s * sigma + r) * n) @ rotation.T
     support = np.maximum(np.linalg.norm(sigma * n, axis=-1, keepdims=True), 1e-300)
     return mean + (s * sigma**2 * n / support + r * n) @ rotation.T

@@ -89,7 +89,8 @@ def active_half_planes(run: ClosedLoop, k: int) -> list[FloatArray]:
     step, i = plan.step, np.flatnonzero(plan.iterate.touched[0])
     positions = step.nodes.positions(plan.X, plan.U)[i]
     sets = NoGoSets.pairs(step.means[0, i + 1], step.covariances[0, i + 1], step.radii[0, i])
-    s, start = np.full(len(i), plan.iterate.s[0]), np.tile(step.here - step.means[0, 0], (len(i), 1))
+    start = np.tile(step.here - step.means[0, 0], (len(i), 1))
+    s = np.full(len(i), plan.iterate.s[0])
     spaces = run.problem.no_go.linearise(sets, positions[:, None], s, start)
     strips = []
     for p, normal, value in zip(positions, spaces.normal[:, 0], spaces.value[:, 0], strict=True):

@@ -74,8 +74,8 @@ def summarise_all(runs: Sequence[ClosedLoop]) -> dict[str, Any]:
 
 def write_summary(runs: Sequence[ClosedLoop], directory: Path) -> dict[str, Any]:
     """Write summary.json and summary.md into a directory and return what is in them."""
-    contents = summarise_all(runs)
-    text = json.dumps(contents, indent=2, allow_nan=False) + "\n"
+    text = json.dumps(summarise_all(runs), indent=2, allow_nan=False) + "\n"
+    contents: dict[str, Any] = json.loads(text)  # tuples are lists there
     (directory / "summary.json").write_text(text, encoding="utf-8")
     (directory / "summary.md").write_text(markdown_report(contents), encoding="utf-8")
     return contents

@@ -54,6 +54,7 @@ class Loop:
         goal: Result | None = None,
         about: FloatArray | None = None,
         screen: bool = True,
+        firm: bool = False,
     ) -> Result | None:
         """Descend from a plan; None if not even the first program was solved, or if given up.
 
@@ -62,9 +63,9 @@ class Loop:
             goal: Give up when it is plain that this plan will not be reached.
             about: (ny,) where the first half-spaces are taken, which need not obey the dynamics.
             screen: Whether to look for obstacles that were left out.
+            firm: Whether to give up where the obstacles would have to yield.
         """
         at, settings, clock = self._at, self._settings, self._at.clock
-        firm = goal is not None and goal.status.ok
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
         region, relaxation, history = Region(at), Relaxation.NOBODY, []
         best: Nominal | None = None
@@ -75,6 +76,9 @@ class Loop:
             condensed = at.condensed(nominal)
             clock.charge("linearise")
             convex = at.solve(nominal, condensed, planes, relaxation, firm, region.radius)
+            if convex is None and planes is not nominal.planes:
+                planes, leaps, bold = nominal.planes, 0, False  # a leap too far
+                continue
             if convex is None:
                 break
             relaxation = convex.relaxation

@@ -124,13 +124,16 @@ class MultiStart:
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
         # A plan with slack is beaten by any without: then all ways are worth their time.
         for one in ranked[:follow] if safe else ranked:
-            if one.merit == inf:
-                break
-            if (not safe and goal.status.ok) or not clock.allows("iteration"):
+            if one.merit == inf or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
             if safe and same_way(step, one.passing, here):
                 continue  # this way leads to where we are
-            rival = self._loop.run(self._start(one), goal, one.about)
+            rival = self._loop.run(self._start(one), goal, one.about, firm=True)
+            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = rival, True
+        # None is without slack; then the one that seems to need the least is worth a try.
+        if not goal.status.ok and ranked and ranked[0].merit < goal.merit:
+            rival = self._loop.run(self._start(ranked[0]), goal, ranked[0].about)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         return Found(goal, tried, switched)

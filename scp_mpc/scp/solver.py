@@ -126,7 +126,7 @@ class SCP:
             )
             try:
                 return self._solve(step, clock, nominal, multi_start)
-            except (ArithmeticError, np.linalg.LinAlgError):
+            except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
                 return self._plan(step, Found(self._fallback.best(step, nominal)), clock)
         finally:

@@ -35,7 +35,7 @@ from scp_mpc.scp.pairs import Pairs, Planes
 from scp_mpc.settings import Settings
 
 _NONE = 1e29  # a bound beyond this is none
-_SLOTS = 2  # for half-spaces at each node; more gain nothing
+_SLOTS = 3  # for half-spaces at each node; more gain nothing
 _COUPLING = 0.1  # of slack to its row, relative to the row's length: more hides the active set
 
 
@@ -118,7 +118,12 @@ class Subproblem:
             above[rates : rates + len(u_last)] += u_last
 
     def write_half_spaces(
-        self, pairs: Pairs, planes: Planes, about: Rollout, yielding: bool = True
+        self,
+        pairs: Pairs,
+        planes: Planes,
+        about: Rollout,
+        yielding: bool = True,
+        room: FloatArray | None = None,
     ) -> Rows:
         """Write the half-spaces of the nearest pairs; return which row is whose.
 
@@ -127,10 +132,11 @@ class Subproblem:
             planes: Their half-spaces.
             about: The plan that positions are linearised about.
             yielding: In an elastic program, whether the obstacles may yield, too.
+            room: (K,) how near the pairs are; None for as near as at the planes' point.
         """
         layout, nodes, S, program = self._layout, self._nodes, self._slots, self.program
         d, N, data = self._problem.model.dim, layout.shape[0], self.program.A.data
-        kept, slot = self._assigned(pairs, planes)
+        kept, slot = self._assigned(pairs, planes.g if room is None else room)
         normal = np.zeros((nodes.size * S, d))
         normal[slot] = planes.a[kept, :d]
         along, e, u = about.along, about.deviations, about.inputs
@@ -213,10 +219,10 @@ class Subproblem:
             self._shift = self._shifts()
         return start[0][self._shift[0]], start[1][self._shift[1]]
 
-    def _assigned(self, pairs: Pairs, planes: Planes) -> tuple[IntArray, IntArray]:
+    def _assigned(self, pairs: Pairs, room: FloatArray) -> tuple[IntArray, IntArray]:
         """Which pairs get a slot, and which: the nearest ones at each node."""
         node, S = pairs.node, self._slots
-        order = np.lexsort((planes.g, node))
+        order = np.lexsort((room, node))
         first = np.searchsorted(node[order], node[order])
         rank = np.arange(len(order)) - first
         within = rank < S
@@ -281,14 +287,13 @@ class Subproblem:
         blocks.add("du before", bounded + later, self._u.start + np.arange(len(later)), -1.0)
         states = bounded + np.arange(layout.yielding.start, layout.yielding.stop)
         blocks.add("z", states, state[:, 0, problem.bounded_states].ravel(), 1.0)
-        n, inner = nodes.discs, nodes.count - nodes.discs
+        inner = nodes.count - nodes.discs
         space = self._spaces.start + np.arange(nodes.size * S).reshape(N, nodes.count, S, 1)
         state, control = state[:, :, None], control[:, :, None]
         blocks.add("at", space[:, inner:], state[..., self._support], 0.0)
         if inner:
             blocks.add("along states", space[1:, :inner], state[:-1], 0.0)
             blocks.add("along inputs", space[:, :inner], control, 0.0)
-        del n
         if layout.moving:
             s = self._s.start + sizes
             blocks.add("slopes", space.reshape(-1, 1), np.broadcast_to(s, (space.size, len(s))), 0.0)

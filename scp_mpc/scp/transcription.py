@@ -24,6 +24,8 @@ from scp_mpc.scp.step import Step
 from scp_mpc.scp.subproblem import Subproblem
 from scp_mpc.settings import Settings
 
+_TOUCH = 1e-7  # distance to a constraint that counts as none
+_REASSIGNMENTS = 3  # of slots, for one program
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
 
 
@@ -266,8 +268,12 @@ class Transcription:
         planes: Planes,
         relaxation: Relaxation,
         radius: FloatArray | None = None,
+        room: FloatArray | None = None,
     ) -> tuple[Subproblem, Rows]:
-        """Write the sparse program of the same constraints; return it, and which row is whose."""
+        """Write the sparse program of the same constraints; return it, and which row is whose.
+
+        `room` (K,) says how near the pairs are: the nearest get the slots.
+        """
         elastic = relaxation is not Relaxation.NOBODY
         subproblem = self.elastic if elastic else self.firm
         about = condensed.about
@@ -277,7 +283,7 @@ class Transcription:
             self._written[elastic] = known
         subproblem.write_bounds(*self._box(condensed, radius), self.step.u_last)
         yielding = relaxation is Relaxation.EVERYBODY
-        return subproblem, subproblem.write_half_spaces(pairs, planes, about, yielding)
+        return subproblem, subproblem.write_half_spaces(pairs, planes, about, yielding, room)
 
     def solve(
         self,
@@ -308,17 +314,40 @@ class Transcription:
                 break  # it was the time that ran out
             clock.begin()
             qp = self.convex_qp(condensed, pairs, planes, give, radius)
-            subproblem, rows = self.write(condensed, pairs, planes, give, radius)
+            solution = self._solved(nominal, condensed, planes, qp, give, radius)
+            if solution is not None:
+                return Convex(condensed, pairs, planes, qp, solution, give)
+        return None
+
+    def _solved(
+        self,
+        nominal: Nominal,
+        condensed: Condensed,
+        planes: Planes,
+        qp: CondensedQP,
+        give: Relaxation,
+        radius: FloatArray | None,
+    ) -> QPSolution | None:
+        """Write a program and have it solved; again, where a pair without a slot was violated."""
+        clock, pairs, room, start = self.clock, nominal.pairs, None, None
+        for _ in range(_REASSIGNMENTS):
+            subproblem, rows = self.write(condensed, pairs, planes, give, radius, room)
             start = self.start(subproblem, nominal)
             clock.charge("update")
             rescue = clock.unlimited or clock.allows("rescue")
             began = clock.elapsed
             solution = subproblem.solver.solve(qp, rows, start, rescue)
             clock.charge("solve")
-            if solution is not None:
-                return Convex(condensed, pairs, planes, qp, solution, give)
+            if solution is not None or subproblem.solver.point is None:
+                return solution
             if rescue:
                 clock.learn("rescue", began)
+            z, _ = subproblem.solver.point
+            v = qp.unbox @ self.boxed(condensed, *subproblem.plan(z, nominal.y[self.layout.s]))
+            room = qp.A @ v - qp.b
+            left_out = rows.place[len(qp.F) :] < 0
+            if room[left_out].min(initial=0.0) >= -_TOUCH or not clock.allows("iteration"):
+                return None
         return None
 
     def start(self, subproblem: Subproblem, nominal: Nominal) -> tuple[FloatArray, FloatArray]:
@@ -467,5 +496,3 @@ class Transcription:
         whole[:n, :n] = back.T @ W @ back
         return whole
 
-
-_TOUCH = 1e-7  # distance to a constraint that counts as none
