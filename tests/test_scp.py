@@ -1,11 +1,11 @@
 """The sequential convex programming: optimal, feasible at every iterate, warm, and honest."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from instances import DT, KINDS, S_REF, instance, obstacle, problem, rotated, straight_reference
+from judge import judge as judged
 
 from scp_mpc import (
     SCP,
@@ -16,13 +16,14 @@ from scp_mpc import (
     Status,
     Trajectory,
 )
-from scp_mpc.solver import KKTResiduals
-from scp_mpc.solver.acceleration import Anderson
-from scp_mpc.solver.descent import Descent, judge
-from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.trusted import TrustedSolver
+from scp_mpc.qp.osqp import OSQP
+from scp_mpc.scp import KKTResiduals, loop
+from scp_mpc.scp.loop import judge
+from scp_mpc.scp.plan import Result
+from scp_mpc.scp.trust_region import Region
 
 KEEP_SIDE = Settings(multi_start=False)
+SOLVERS = pytest.mark.parametrize("solver", ["osqp", "piqp"])
 
 
 def test_no_obstacle_equals_the_riccati_solution():
@@ -57,20 +58,20 @@ def test_a_step_without_active_obstacle_takes_one_program():
     assert first.iterations == 0
     assert first.status is Status.CONVERGED
     assert not first.multipliers.obstacles.any()
-    sparse = SCP(case, Settings(condense=False))
     moved = ref[0] + [0.0, 0.1, 0.0, 0.0]
-    second = sparse.solve(moved, ref, far, first.iterate)
-    assert second.iterations == 1
-    assert second.qps == {"osqp": 1}
+    second = solver.solve(moved, ref, far, first.iterate)
+    assert second.iterations == 0
+    assert second.qps == {"kkt": 1}
     assert not second.multipliers.obstacles.any()
 
 
-def test_input_bounds_alone_take_one_program_of_the_active_set_method():
+@SOLVERS
+def test_input_bounds_alone_take_one_program(solver):
     case = problem(20)
-    plan = SCP(case).solve(
+    plan = SCP(case, Settings(solver=solver)).solve(
         np.zeros(4), np.array([30.0, 0.0, 0.0, 0.0]), [obstacle(20, (0.0, 50.0))]
     )
-    assert plan.qps == {"daqp": 1}
+    assert plan.qps == {solver: 1}
     assert plan.status is Status.CONVERGED
     assert plan.U[0, 0] == 3.0
 
@@ -114,18 +115,15 @@ def test_plans_obey_the_dynamics_the_bounds_and_the_no_go_sets(inflation):
 
 def test_warm_start_cuts_qp_iterations(monkeypatch):
     """From the shifted plan with its multipliers, OSQP needs a fraction of the cold count."""
-    counts = []
-    residuals = TrustedSolver._residuals
+    counts, run = [], OSQP.run
 
-    def counting(self, solution):
-        counts.append(solution.iterations)
-        return residuals(self, solution)
+    def counting(self, effort):
+        counts.append(effort)
+        return run(self, effort)
 
-    monkeypatch.setattr(TrustedSolver, "_residuals", counting)
+    monkeypatch.setattr(OSQP, "run", counting)
     case = instance("beside", 30, "exact", S_REF, 0)
-    settings = Settings(
-        multi_start=False, condense=False, qp=QPSettings(max_iterations=20000, rescue=False)
-    )
+    settings = Settings(multi_start=False, qp=QPSettings(rescue=False))
     solver = SCP(case.problem, settings)
     plan = solver.solve(case.x0, case.x_ref, case.obstacles)
     cold = sum(counts)
@@ -163,8 +161,8 @@ def test_what_cannot_be_avoided_is_softened_and_said_so():
     assert not plan.ok
     assert plan.slack.max() > 0.1
     # The slack is the true violation, stage by stage.
-    value = StepData.read(case, x0, ref, obstacles).half_spaces(plan.X, plan.iterate.s).value
-    np.testing.assert_allclose(np.maximum(0.0, -value), plan.slack, atol=1e-6)
+    distances = judged(case, x0, ref, obstacles, plan).distances
+    np.testing.assert_allclose(np.maximum(0.0, -distances), plan.slack, atol=1e-6)
     assert plan.kkt.worst <= 1e-6
     assert (np.abs(plan.multipliers.obstacles) <= case.slack_weight * (1 + 1e-9)).all()
 
@@ -185,7 +183,7 @@ def test_running_out_of_iterations_is_said_so():
     assert plan.kkt.worst > 1e-6
 
 
-DEAD = Settings(condense=False, qp=QPSettings(max_iterations=1, check_interval=1, rescue=False))
+DEAD = Settings(qp=QPSettings(iterations=(1,), repairs=(0,), rescue=False))
 
 
 def test_without_any_solution_the_robot_brakes_within_limits():
@@ -201,10 +199,9 @@ def test_without_any_solution_the_robot_brakes_within_limits():
     np.testing.assert_array_equal(plan.X[0], x0)
     assert plan.kkt.stationarity == np.inf
     assert plan.kkt.feasibility == plan.slack.max()
-    step = StepData.read(case.problem, x0, case.x_ref, case.obstacles)
-    value = step.half_spaces(plan.X, np.array([S_REF])).value
-    assert value.min() < -0.01
-    np.testing.assert_allclose(plan.slack, np.maximum(0.0, -value), atol=1e-12)
+    distances = judged(case.problem, x0, case.x_ref, case.obstacles, plan).distances
+    assert distances.min() < -0.01
+    np.testing.assert_allclose(plan.slack, np.maximum(0.0, -distances), atol=1e-12)
     assert plan.multipliers is None
 
 
@@ -287,13 +284,13 @@ def test_a_rival_that_breaks_down_does_not_lose_the_plan(monkeypatch):
     case, ref, slow, guess = far_side()
     kept = SCP(case, KEEP_SIDE).solve(ref[0], ref, slow, guess)
     broken = SCP(case)
-    descend, calls = broken._resolution.coarse.primary.descend, []
+    run, calls = broken._loop.run, []
 
-    def breaking(nominal, limit, goal=None):
+    def breaking(nominal, goal=None, *about, **firm):
         calls.append(goal)
-        return descend(nominal, limit, goal) if goal is None else None
+        return run(nominal, goal, *about, **firm) if goal is None else None
 
-    monkeypatch.setattr(broken._resolution.coarse.primary, "descend", breaking)
+    monkeypatch.setattr(broken._loop, "run", breaking)
     plan = broken.solve(ref[0], ref, slow, guess)
     assert len(calls) == 2
     assert not plan.switched
@@ -303,7 +300,7 @@ def test_a_rival_that_breaks_down_does_not_lose_the_plan(monkeypatch):
 
 def test_a_rival_must_lead_and_safety_comes_first():
     def end(merit, status=Status.CONVERGED):
-        return Descent(None, merit, merit, KKTResiduals(0.0, 0.0, 0.0), status, 1)
+        return Result(None, merit, merit, KKTResiduals(0.0, 0.0, 0.0), status, 1)
 
     assert end(0.8).beats(end(1.0), lead=0.1)
     assert not end(0.95).beats(end(1.0), lead=0.1)
@@ -311,32 +308,32 @@ def test_a_rival_must_lead_and_safety_comes_first():
     assert not end(0.1, Status.SOFTENED).beats(end(9.0), lead=0.0)
 
 
-def test_an_extrapolation_that_costs_more_is_taken_back(monkeypatch):
-    """A proposal a metre off the mark: the plan must be as good as without any."""
+def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
+    """Half-spaces about a point a metre off the mark: the plan must be as good as without."""
     case = instance("ahead", 20, "exact", S_REF, 0)
-    settings = Settings(multi_start=False, condense=False, acceleration=False, max_iterations=300)
-    plain = SCP(case.problem, settings)
+    settings = Settings(multi_start=False, max_iterations=300)
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
-    expected = plain.solve(case.x0, case.x_ref, case.obstacles, guess)
-    rejected, reject = [], Anderson.reject
+    given = case.x0, case.x_ref, case.obstacles, guess
+    with monkeypatch.context() as plain:
+        plain.setattr(loop, "refined", lambda at, convex, leaps: (convex.solution, None))
+        expected = SCP(case.problem, settings).solve(*given)
+    rejected, accepts = [], Region.accepts
 
-    def astray(self, iterate):
-        if self._next is None:
-            return None
-        states = iterate.states.copy()
-        states[1:, 2] += 1.0
-        return replace(iterate, states=states)
+    def astray(at, convex, leaps):  # noqa: ARG001
+        ahead = convex.condensed.y(convex.solution.v)
+        ahead[at.layout.p][1::2] += 1.0
+        return convex.solution, ahead
 
-    def counting(self):
-        rejected.append(1)
-        reject(self)
+    def counting(self, *trial):
+        accepted = accepts(self, *trial)
+        rejected.extend([1] * (not accepted))
+        return accepted
 
-    monkeypatch.setattr(Anderson, "propose", astray)
-    monkeypatch.setattr(Anderson, "reject", counting)
-    bold = SCP(case.problem, Settings(multi_start=False, condense=False, max_iterations=300))
-    plan = bold.solve(case.x0, case.x_ref, case.obstacles, guess)
+    monkeypatch.setattr(loop, "refined", astray)
+    monkeypatch.setattr(Region, "accepts", counting)
+    plan = SCP(case.problem, settings).solve(*given)
     assert rejected
-    assert plan.status is Status.CONVERGED
+    assert expected.status is plan.status is Status.CONVERGED
     assert plan.cost == pytest.approx(expected.cost, rel=1e-6)
 
 

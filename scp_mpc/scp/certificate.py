@@ -21,6 +21,7 @@ Notation:
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import qr
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
@@ -32,7 +33,9 @@ from scp_mpc.scp.pairs import Pairs, Planes
 _NOTHING = np.zeros(0)
 _STRONG = 1e-6  # force, relative to the largest, from which a constraint is strongly active
 _TOUCH = 1e-7  # distance to a constraint that is none
-_BENT = 1e-6  # of the largest curvature: what is less is taken for flat
+_DEPENDENT = 1e-9  # of the largest pivot: none
+_LEAST = 1e-300
+BENT = 1e-6  # of the largest curvature: what is less is taken for flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +191,9 @@ class Certificate:
 
 
 def least_curvature(
-    W: FloatArray, rows: FloatArray, force: FloatArray
+    W: FloatArray | None, bends: FloatArray, rows: FloatArray, force: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Smallest curvature of I + W that the active constraints leave, over its largest.
+    """Smallest curvature of I + W - L'L that the active constraints leave, over its largest.
 
     Necessary at a minimum is that no direction of the critical cone bends down. The strongly active
     rows take directions away altogether. Of the weakly active ones only half of the directions may
@@ -198,7 +201,8 @@ def least_curvature(
     moves away from all of them; else they are held.
 
     Args:
-        W: (nv, nv) as above.
+        W: (nv, nv) as above; None for zero.
+        bends: (q, nv) L.
         rows: (k, nv) gradients of the active constraints, towards where they allow to go.
         force: (k,) their forces, non-negative.
 
@@ -206,30 +210,41 @@ def least_curvature(
         The smallest eigenvalue over the largest, and its direction (nv,).
     """
     weak = force <= _STRONG * max(1.0, float(force.max(initial=0.0)))
-    least, direction = _smallest(W, rows[~weak])
-    if least >= -_BENT or not weak.any():
+    least, direction = _smallest(W, bends, rows[~weak])
+    if least >= -BENT or not weak.any():
         return least, direction
     along = rows[weak] @ direction
     if (along >= -_TOUCH).all() or (along <= _TOUCH).all():
         return least, direction if (along >= -_TOUCH).all() else -direction
-    return _smallest(W, rows)
+    return _smallest(W, bends, rows)
 
 
-def _smallest(W: FloatArray, rows: FloatArray) -> tuple[float, FloatArray]:
-    """Smallest eigenvalue of I + W on the null space of some rows, over the largest."""
-    M = W.copy()
-    M.flat[:: len(M) + 1] += 1.0
+def _smallest(
+    W: FloatArray | None, bends: FloatArray, rows: FloatArray
+) -> tuple[float, FloatArray]:
+    """Smallest eigenvalue on the null space of some rows, over the largest, and its direction."""
+    nv = bends.shape[1]
     basis = None
-    if len(rows):
-        _, sizes, basis = np.linalg.svd(rows, full_matrices=True)
-        rank = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
-        basis = basis[rank:]
-        if not len(basis):  # nothing is left to move in
-            return 1.0, np.zeros(len(W))
-        M = basis @ M @ basis.T
+    if len(rows):  # orthonormal rows that span theirs
+        Q, R, _ = qr(rows.T, mode="economic", pivoting=True)
+        size = np.abs(R.diagonal())
+        basis = Q[:, size > _DEPENDENT * size[0]]
+        if basis.shape[1] == nv:  # nothing is left to move in
+            return 1.0, np.zeros(nv)
+    if W is None:  # the eigenvalues of I - L'L on a subspace are those of a matrix as small as L
+        inner = bends if basis is None else bends - (bends @ basis) @ basis.T
+        values, vectors = np.linalg.eigh(inner @ inner.T)
+        if not len(values):
+            return 1.0, np.zeros(nv)
+        return float(1.0 - values[-1]) / max(1.0, float(values[-1]) - 1.0), vectors[:, -1] @ inner
+    M = W - bends.T @ bends
+    M.flat[:: nv + 1] += 1.0
+    if basis is not None:
+        across = basis.T @ M
+        M -= basis @ across + across.T @ basis.T - basis @ (across @ basis) @ basis.T
+        M += np.abs(M).max() * (basis @ basis.T)  # directions that are gone bend up
     values, vectors = np.linalg.eigh(M)
-    direction = vectors[:, 0] if basis is None else vectors[:, 0] @ basis
-    return float(values[0] / max(np.abs(values).max(), 1e-300)), direction
+    return float(values[0]) / max(float(np.abs(values).max()), _LEAST), vectors[:, 0]
 
 
 def with_curvature(nominal: Nominal, least: float) -> Nominal:

@@ -23,9 +23,9 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.scp.candidates import Passing, same_way
-from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.certificate import BENT, Nominal, with_curvature
 from scp_mpc.scp.iterate import NEGLIGIBLE, Iterate
-from scp_mpc.scp.newton import corrected, refined
+from scp_mpc.scp.newton import corrected, downhill, refined
 from scp_mpc.scp.history import Record
 from scp_mpc.scp.plan import Result, Status
 from scp_mpc.scp.trust_region import Region
@@ -106,7 +106,13 @@ class Loop:
             nominal = best = trial
             planes = trial.planes
             if trial.residuals.worst <= settings.tolerance:
-                break
+                least, direction = at.second_order(trial)
+                best = with_curvature(trial, least)
+                away = downhill(at, trial, direction) if least < -BENT else None
+                if away is None:
+                    break
+                nominal, planes, leaps, bold = away, away.planes, 0, True  # it was a saddle
+                continue
             if goal is not None and self._vain(iterations, trial, goal):
                 return None
             leaps = leaps + 1 if ahead is not None and len(ahead) else 0
@@ -179,6 +185,6 @@ def _most(nominal: Nominal) -> float:
 def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
     """Return the status of a plan with the given residuals and largest slack."""
     inside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
-    if residuals.worst <= tolerance and slack == slack:
+    if residuals.worst <= tolerance and slack == slack and not residuals.curvature < -BENT:
         return Status.SOFTENED if inside else Status.CONVERGED
     return Status.VIOLATING if inside else Status.FEASIBLE

@@ -154,8 +154,9 @@ class MultiStart:
         alone = nominal.y.copy()
         alone[c.p] = (free - at.step.here).ravel()
         near = at.near(alone, at.near(nominal.y, known))
-        nominal = at.renewed(nominal, Pairs(at.step, c, near))
+        nominal = at.with_pairs(nominal, Pairs(at.step, c, near))
         condensed, give = at.condensed(nominal), at.relaxations(safe)[-1]
+        nobody, nothing = np.zeros(near.shape, dtype=np.bool_), (np.zeros(0),) * 3
         limit, found = _HOPELESS * best.merit if safe else inf, list[Ranked]()
         for path, about, planes in zip(paths, ys, nominal.pairs.about(ys), strict=True):
             if at.clock.remaining < 0:
@@ -164,11 +165,14 @@ class MultiStart:
             subproblem, rows = at.write(condensed, nominal.pairs, planes, give)
             start = at.start(subproblem, nominal)
             bound, (z, y) = subproblem.solver.rank(qp, rows, start, limit)
+            if bound == inf:
+                found.append(Ranked(inf, Passing(path, nobody), about, *nothing))
+                continue
             inputs, sizes = subproblem.plan(z, nominal.y[c.s])
             force = rows.forces(y)
             there = at.path(condensed.y(qp.unbox @ at.boxed(condensed, inputs, sizes)))[1:]
             push = nominal.pairs.table(force[len(qp.F) :] > NEGLIGIBLE)
-            passing = Passing(path if bound == inf else there, push)
+            passing = Passing(there, push)
             found.append(Ranked(bound, passing, about, inputs, sizes, force))
             if safe and self._settings.max_candidates == 1:
                 limit = min(limit, bound)

@@ -35,6 +35,8 @@ from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.transcription import Convex, Transcription
 
 _ROUNDING = 1e-9  # violation of a linearised constraint that is none
+_STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
+_LESS = 1e-9  # relative fall of the merit that is none
 _STRIDE = 4.0  # steps to look ahead where they lead away; its powers if they still do
 
 
@@ -145,3 +147,29 @@ def newton_step(solution: QPSolution, step: FloatArray, W: FloatArray) -> QPSolu
         change, _ = dpotrs(solution.factor, solution.rows @ (W @ (step + z)))
         force[solution.indices] += change
     return replace(solution, v=solution.v + z, force=force)
+
+
+def downhill(at: Transcription, saddle: Nominal, direction: FloatArray) -> Nominal | None:
+    """Leave a saddle along a direction (N, nu) of negative curvature; None where that is in vain.
+
+    The first of some ever shorter steps, to either side, after which the merit is less.
+    """
+    problem, weight = at.problem, at.problem.slack_weight
+    span = np.where(problem.u_max > problem.u_min, problem.u_max - problem.u_min, 1.0)
+    largest = float(np.abs(direction / span).max())
+    if not largest > 0:
+        return None
+    before = saddle.cost + weight * float(np.maximum(-saddle.planes.g, 0.0).sum())
+    s = saddle.y[at.layout.s]
+    for length in _STEPS:
+        for sign in (length, -length):
+            inputs = saddle.rollout.inputs + sign / largest * direction
+            y, rollout = at.rolled(inputs, s)
+            none = np.zeros(len(saddle.force))
+            trial = at.certify(
+                y, rollout, saddle.reaction, saddle.pairs, none, none.astype(np.bool_)
+            )
+            after = trial.cost + weight * float(np.maximum(-trial.planes.g, 0.0).sum())
+            if after < before - _LESS * abs(before):
+                return trial
+    return None

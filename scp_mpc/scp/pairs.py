@@ -59,7 +59,9 @@ class Pairs:
         self.at[:, d] = layout.s.start + j
         self._step, self._p = step, layout.p
         self._sensitivity: FloatArray | None = None
-        covariances = step.covariances[j, i + 1] if step.count else np.zeros((0, d, d))
+        if not len(j):  # most steps: no obstacle is near, and the geometry has nothing to say
+            return
+        covariances = step.covariances[j, i + 1]
         shapes = None if step.shapes is None else step.shapes.taken(j)
         self._sets = NoGoSets.pairs(step.means[j, i + 1], covariances, step.radii[j, i], shapes)
         self._means_before = step.means[j, i]
@@ -72,6 +74,9 @@ class Pairs:
 
     def planes(self, y: FloatArray) -> Planes:
         """Linearise about y."""
+        if not len(self.node):
+            none, d = np.zeros(0), self.at.shape[1] - 1
+            return Planes(y, none, np.zeros((0, d + 1)), HalfSpaces.none(0, 1, d))
         path = self._step.path(y[self._p])
         positions, s = path[self.node + 1][:, None], y[self.at[:, -1]]
         spaces = self._step.problem.no_go.linearise(

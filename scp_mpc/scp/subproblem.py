@@ -28,7 +28,7 @@ from scp_mpc.qp.backend import ProgramSolver, Rows
 from scp_mpc.qp.program import QuadraticProgram
 from scp_mpc.qp.sparse_blocks import SparseBlocks
 from scp_mpc.robots.linear import LinearModel
-from scp_mpc.scp.condensing import Rollout
+from scp_mpc.scp.condensing import Derivatives, Rollout
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.pairs import Pairs, Planes
@@ -101,6 +101,8 @@ class Subproblem:
         right = e - (B @ u[..., None])[..., 0]
         right[1:] -= (A[1:] @ e[:-1, :, None])[..., 0]
         self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = right.ravel()
+        rest = about.positions.ravel() - about.along.moved(e[..., None], u[..., None])[:, 0]
+        self._rest = rest
         if self._linear:
             return
         self.program.P.data[:] = self._plain
@@ -121,7 +123,7 @@ class Subproblem:
         self,
         pairs: Pairs,
         planes: Planes,
-        about: Rollout,
+        along: Derivatives,
         yielding: bool = True,
         room: FloatArray | None = None,
     ) -> Rows:
@@ -130,7 +132,7 @@ class Subproblem:
         Args:
             pairs: All pairs that are near.
             planes: Their half-spaces.
-            about: The plan that positions are linearised about.
+            along: How positions depend on states and inputs, about the plan of the dynamics.
             yielding: In an elastic program, whether the obstacles may yield, too.
             room: (K,) how near the pairs are; None for as near as at the planes' point.
         """
@@ -139,7 +141,6 @@ class Subproblem:
         kept, slot = self._assigned(pairs, planes.g if room is None else room)
         normal = np.zeros((nodes.size * S, d))
         normal[slot] = planes.a[kept, :d]
-        along, e, u = about.along, about.deviations, about.inputs
         grouped = normal.reshape(N, nodes.count, S, d)
         n = nodes.discs
         at = along.at.reshape(N, n, d, -1)[..., self._support]
@@ -152,9 +153,9 @@ class Subproblem:
             slope = np.zeros((nodes.size * S, layout.moving))
             slope[slot, pairs.obstacle[kept]] = planes.a[kept, d]
             data[self._places["slopes"]] = slope.ravel()
-        rest = about.positions.ravel() - along.moved(e[..., None], u[..., None])[:, 0]
-        moved = planes.y[pairs.at[kept]]
-        moved[:, :d] -= rest[pairs.at[kept, :d]]
+        at = pairs.at[kept]
+        moved = planes.y[at]
+        moved[:, :d] -= self._rest[at[:, :d]]
         offset = np.add.reduce(planes.a[kept] * moved, axis=1) - planes.g[kept]
         if not layout.moving:
             offset -= planes.a[kept, d] * moved[:, d]

@@ -4,7 +4,7 @@ Notation as in `layout.py`, `condensing.py`, `pairs.py` and `certificate.py`.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -67,7 +67,14 @@ class Transcription:
         problem: The problem.
         settings: Who solves its programs.
         nodes: Where plans are constrained.
+
+    Attributes:
+        nobody: No pairs at all.
+        free: (N, nu) inputs of the plan that ignores the obstacles; nonlinear robots' only.
     """
+
+    free: FloatArray | None
+    nobody: Pairs
 
     def __init__(self, problem: Problem, settings: Settings, nodes: Nodes) -> None:
         """Condense the problem, lay the programs out and set up their solvers."""
@@ -95,7 +102,7 @@ class Transcription:
         self.step, self.clock, self.free = step, clock, None
         self.condenser.begin(step)
         self.bounds = self.layout.bounds(step)
-        self.free: FloatArray | None
+        self.nobody = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
         self._written: dict[bool, object] = {}
         for subproblem in (self.firm, self.elastic):
             subproblem.solver.finished = Counter()
@@ -161,11 +168,6 @@ class Transcription:
             np.zeros(0, dtype=np.bool_),
         )
 
-    @property
-    def nobody(self) -> Pairs:
-        """No pairs at all."""
-        return Pairs(self.step, self.layout, np.zeros(self.step.radii.shape, dtype=np.bool_))
-
     def certify(
         self,
         y: FloatArray,
@@ -217,14 +219,16 @@ class Transcription:
 
     def renewed(self, nominal: Nominal, pairs: Pairs) -> Nominal:
         """The same plan with other pairs, which include those that push."""
-        force, old = np.zeros(pairs.near.shape), nominal.pairs
-        capped = np.zeros(pairs.near.shape, dtype=np.bool_)
-        force[old.obstacle, old.node] = nominal.force
-        capped[old.obstacle, old.node] = nominal.slack > 0
-        at = pairs.obstacle, pairs.node
+        capped = nominal.pairs.table(nominal.slack > 0)[pairs.obstacle, pairs.node]
+        force = nominal.pairs.table(nominal.force)[pairs.obstacle, pairs.node]
         return self.certify(
-            nominal.y, nominal.rollout, nominal.reaction, pairs, force[at], capped[at]
+            nominal.y, nominal.rollout, nominal.reaction, pairs, force, capped
         )
+
+    def with_pairs(self, nominal: Nominal, pairs: Pairs) -> Nominal:
+        """The same plan as a start for programs with other pairs; not certified for them."""
+        force = nominal.pairs.table(nominal.force)[pairs.obstacle, pairs.node]
+        return replace(nominal, pairs=pairs, force=force)
 
     # --- programs
 
@@ -283,7 +287,7 @@ class Transcription:
             self._written[elastic] = known
         subproblem.write_bounds(*self._box(condensed, radius), self.step.u_last)
         yielding = relaxation is Relaxation.EVERYBODY
-        return subproblem, subproblem.write_half_spaces(pairs, planes, about, yielding, room)
+        return subproblem, subproblem.write_half_spaces(pairs, planes, about.along, yielding, room)
 
     def solve(
         self,
@@ -370,6 +374,9 @@ class Transcription:
             L (q, nv) in condensed coordinates; which pairs push; L (k, w, d-1) on outputs.
         """
         pairs, planes = convex.pairs, convex.planes
+        if not len(force):
+            none, d = np.zeros((0, convex.qp.F.shape[1])), self.problem.model.dim
+            return none, np.zeros(0, dtype=np.intp), np.zeros((0, d + 1, d - 1))
         push = (force > NEGLIGIBLE).nonzero()[0]
         L = pairs.bend(planes)[push] * np.sqrt(force[push])[:, None, None]
         rows = pairs.rows(convex.condensed.by.S)[push]
@@ -378,15 +385,18 @@ class Transcription:
 
     def curvature(self, convex: Convex, solution: QPSolution) -> FloatArray:
         """W (nv, nv): what the convex program leaves out of the Lagrangian's second derivative."""
-        nf = len(convex.qp.F)
-        force, bends = solution.force[nf:], np.zeros((0, len(solution.v)))
-        if len(force):
-            bends = self.bends(convex, force)[0]
+        bends = self.bends(convex, solution.force[len(convex.qp.F) :])[0]
+        W = self._dynamics_curvature(convex, solution)
+        return -bends.T @ bends if W is None else W - bends.T @ bends
+
+    def _dynamics_curvature(self, convex: Convex, solution: QPSolution) -> FloatArray | None:
+        """The part (nv, nv) of dynamics and positions; None of a linear robot."""
         if self.linear:
-            return -bends.T @ bends
+            return None
+        nf = len(convex.qp.F)
         condensed, certificate = convex.condensed, self._certificate
         about, e = condensed.about, condensed.deviations(solution.v)
-        phi = certificate.phi(convex.pairs, convex.planes, force)
+        phi = certificate.phi(convex.pairs, convex.planes, solution.force[nf:])
         nu = certificate.costates(about, certificate.track(e), solution.force[:nf], phi)[0]
         on_p = np.zeros(self.layout.p.stop) if phi is None else phi[self.layout.p]
         states = self.step.x_ref.copy()
@@ -394,31 +404,30 @@ class Transcription:
         states[1:] += about.deviations
         assert isinstance(self.nodes, NonlinearNodes)
         stages, sway = self.nodes.curvature(states, about.inputs, -nu, -on_p)
-        return self._condensed_curvature(condensed, stages, sway) - bends.T @ bends
+        return self._condensed_curvature(condensed, stages, sway)
 
     def second_order(self, nominal: Nominal) -> tuple[float, FloatArray]:
-        """Smallest curvature at a plan, over the largest, and its direction (nv,)."""
+        """Smallest curvature at a plan, over the largest, and its direction (N, nu) in inputs."""
         condensed = self.condensed(nominal)
         qp = self.convex_qp(condensed, nominal.pairs, nominal.planes, Relaxation.NOBODY)
         force = np.concatenate([nominal.reaction, nominal.force])
         v, nf = condensed.here, len(qp.F)
-        bounded, gap = qp.F @ v, qp.A @ v - qp.b
-        touched = np.concatenate(
-            [np.minimum(bounded - qp.lower, qp.upper - bounded) <= _TOUCH, gap <= _TOUCH]
-        )
-        capped = nominal.slack > 0
-        touched[nf:] &= ~capped
-        sign = np.concatenate(
-            [np.where(bounded - qp.lower <= qp.upper - bounded, 1.0, -1.0), np.ones(len(gap))]
-        )
-        at = touched.nonzero()[0]
+        bounded = qp.F @ v
+        below, above = bounded - qp.lower, qp.upper - bounded
+        capped = np.zeros(len(force), dtype=np.bool_)
+        capped[nf:] = nominal.slack > 0
+        room = np.concatenate([np.minimum(below, above), qp.A @ v - qp.b])
+        at = (((room <= _TOUCH) | (np.abs(force) > NEGLIGIBLE)) & ~capped).nonzero()[0]
+        nearer = np.append(below <= above, np.ones(len(room) - nf, dtype=np.bool_))
+        sign = np.where(force == 0, np.where(nearer, 1, -1), np.sign(force))
         rows = np.concatenate([qp.F, qp.A])[at] * sign[at, None]
         none = np.zeros((0, 0))
         solution = QPSolution(v, force, at, capped, none, at, none)
-        convex = Convex(
-            condensed, nominal.pairs, nominal.planes, qp, solution, Relaxation.NOBODY
-        )
-        return least_curvature(self.curvature(convex, solution), rows, np.abs(force[at]))
+        convex = Convex(condensed, nominal.pairs, nominal.planes, qp, solution, Relaxation.NOBODY)
+        W, bends = self._dynamics_curvature(convex, solution), self.bends(convex, force[nf:])[0]
+        least, direction = least_curvature(W, bends, rows, np.abs(force[at]))
+        inputs = condensed.by.inverse.T @ direction[: len(condensed.by.inverse)]
+        return least, inputs.reshape(self.layout.shape)
 
     # --- what is handed out
 
