@@ -21,11 +21,11 @@ class QPSettings:
         rescue: Whether to ask PIQP for what is not solved then.
     """
 
-    rho: tuple[float, ...] = (10.0, 1.0, 100.0, 1.0, 100.0)
+    rho: tuple[float, ...] = (10.0, 1.0)
     sigma: float = 1e-6
     alpha: float = 1.6
-    iterations: tuple[int, ...] = (10, 25, 25, 50, 50)
-    repairs: tuple[int, ...] = (1, 1, 1, 3, 7)
+    iterations: tuple[int, ...] = (10, 25)
+    repairs: tuple[int, ...] = (1, 100)
     rescue: bool = True
 
     def __post_init__(self) -> None:

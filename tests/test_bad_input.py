@@ -22,6 +22,7 @@ from scp_mpc import (
     TooManyObstaclesError,
     Trajectory,
 )
+from scp_mpc.qp.others import installed, known
 
 NAN, INF = np.nan, np.inf
 
@@ -129,12 +130,15 @@ def test_bad_margins_are_refused(values, message):
     [
         {"tolerance": 0.0},
         {"tolerance": NAN},
-        {"tolerance": 1e-9},  # finer than what the quadratic programs deliver
         {"max_iterations": 0},
         {"max_iterations": True},
         {"multi_start_interval": -2},
         {"multi_start": "no"},
-        {"acceleration": 1},
+        {"history": 1},
+        {"solver": None},
+        {"max_candidates": 0},
+        {"deadline": 0.0},
+        {"freshness": None},
         {"qp": None},
     ],
 )
@@ -143,10 +147,40 @@ def test_bad_settings_are_refused(values):
         Settings(**values)
 
 
-@pytest.mark.parametrize("values", [{"rescue": "piqp"}, {"cold": 0.0}, {"max_iterations": 0}])
-def test_bad_qp_settings_are_refused(values):
-    with pytest.raises(InvalidArgumentError):
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rescue": "piqp"}, "rescue: 'piqp'"),
+        ({"rho": 10.0}, "qp.rho: 10.0 is not a tuple"),
+        ({"rho": ()}, "qp.rho"),
+        ({"rho": (10.0, 0.0)}, "qp.rho: 0.0"),
+        ({"rho": (NAN,)}, "qp.rho: nan"),
+        ({"sigma": 0.0}, "qp.sigma: 0.0"),
+        ({"sigma": -1e-6}, "qp.sigma: -1e-06"),
+        ({"alpha": 0.0}, "qp.alpha"),
+        ({"alpha": 2.0}, "qp.alpha: 2.0 is not below 2"),
+        ({"iterations": 10, "repairs": 1}, "qp.iterations: 10 is not a tuple"),
+        ({"iterations": (), "repairs": ()}, "qp.iterations"),
+        ({"iterations": (0,), "repairs": (1,)}, "qp.iterations"),
+        ({"iterations": (1.5,), "repairs": (1,)}, "qp.iterations"),
+        ({"iterations": (10,), "repairs": (-1,)}, "qp.repairs"),
+        ({"iterations": (10, 10), "repairs": (1,)}, "qp.repairs: 1 entries, but 2"),
+    ],
+)
+def test_bad_qp_settings_are_refused(values, message):
+    with pytest.raises(InvalidArgumentError, match=message):
         QPSettings(**values)
+
+
+def test_solvers_that_are_not_there_are_refused_and_those_that_are_named():
+    missing = sorted(set(known()) - set(installed()))[0]
+    for name, message in (
+        ("simplex", "solver: 'simplex' is none of osqp, piqp"),
+        (missing, f"solver: '{missing}' is not installed: pip install 'qpsolvers.{missing}.'"),
+    ):
+        for owner in (SCP, MPC):
+            with pytest.raises(InvalidArgumentError, match=message):
+                owner(problem(N), Settings(solver=name))
 
 
 def test_settings_of_the_wrong_kind_are_refused():

@@ -23,11 +23,11 @@ from scp_mpc import (
 from scp_mpc.comparison.audit import audit
 from scp_mpc.comparison.nlp import Unknowns
 from scp_mpc.comparison.staged import Staged
-from scp_mpc.solver import Multipliers
+from scp_mpc.scp import Multipliers
 
 NAN, INF = np.nan, np.inf
 N = 8
-SPARSE = Settings(condense=False)
+PIQP = Settings(solver="piqp")
 SPEED = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -INF, -INF]}
 
 
@@ -141,13 +141,17 @@ def test_limited_inputs_keep_all_bounds_and_change_no_more_than_they_must(inputs
 
 def test_multipliers_of_bounds_move_with_their_stage_and_need_not_be_there():
     rng = np.random.default_rng(0)
-    shapes = (N, 4), (N, 2), (1,), (1, N), (1, N), (N, 3), (N, 2)
-    duals = Multipliers(*(rng.normal(size=shape) for shape in shapes))
     later = [*range(1, N), N - 1]
-    for old, new in ((duals, duals.shifted()), (duals, duals.resampled(4).shifted())):
+    for nodes in (N, 4 * N):
+        shapes = (N, 4), (N, 2), (1,), (1, nodes), (1, nodes), (N, 3), (N, 2)
+        old = Multipliers(*(rng.normal(size=shape) for shape in shapes))
+        new = old.shifted()
         np.testing.assert_array_equal(new.states, old.states[later])
         np.testing.assert_array_equal(new.rates, old.rates[later])
-    bare = Multipliers(*list(vars(duals).values())[:5])
+        for name in ("obstacles", "slack"):
+            stages = getattr(old, name).reshape(N, -1)
+            np.testing.assert_array_equal(getattr(new, name).reshape(N, -1), stages[later])
+    bare = Multipliers(*list(vars(old).values())[:5])
     assert bare.shifted().states.size == bare.shifted().rates.size == 0
 
 
@@ -155,7 +159,7 @@ def test_a_guess_brings_the_multipliers_of_all_bounds_or_none():
     this, ref = problem(N, x_max=[INF, 2.0, INF, 2.0], du_max=1.0), straight_reference(N)
     zeros = [np.zeros(shape) for shape in ((N, 4), (N, 2), (1,), (1, N), (1, N))]
     guess = Iterate(ref, np.zeros((N, 2)), np.ones(1), np.zeros((1, N)), Multipliers(*zeros))
-    solver = SCP(this, SPARSE)
+    solver = SCP(this, PIQP)
     solver.solve(ref[0], ref, [], guess)
     for name, columns in (("states", 4), ("rates", 3)):
         duals = replace(guess.multipliers, **{name: np.zeros((N, columns))})
@@ -178,7 +182,7 @@ def test_a_bad_last_input_is_refused_and_leaves_no_trace(u_last, error, changes)
     ref = straight_reference(N)
     plans = []
     for disturbed in (False, True):
-        mpc = MPC(problem(N, **changes), SPARSE)
+        mpc = MPC(problem(N, **changes), PIQP)
         for k in range(3):
             if disturbed:
                 with pytest.raises(error, match="u_last"):
@@ -186,7 +190,7 @@ def test_a_bad_last_input_is_refused_and_leaves_no_trace(u_last, error, changes)
             plans.append(mpc.step(ref[k], ref + [0, 0, 0.1, 0]))
     assert same(plans[:3], plans[3:])
     with pytest.raises(error, match="u_last"):
-        SCP(problem(N, **changes), SPARSE).solve(ref[0], ref, u_last=u_last)
+        SCP(problem(N, **changes), PIQP).solve(ref[0], ref, u_last=u_last)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +211,7 @@ def test_peers_refuse_what_they_do_not_bound(changes, message):
 
 def test_the_audit_finds_rates_and_states_beyond_their_bounds():
     this, ref = problem(N, du_max=0.5, du_min=-0.5, **SPEED), straight_reference(N)
-    plan = SCP(this, SPARSE).solve(ref[0], ref)
+    plan = SCP(this, PIQP).solve(ref[0], ref)
     assert plan.ok
     assert audit(this, ref[0], [], plan) == audit(problem(N), ref[0], [], plan)
     fast = SCP(problem(N)).solve(ref[0], straight_reference(N, 4.0))

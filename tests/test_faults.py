@@ -28,8 +28,11 @@ from scp_mpc import (
     StaleDataError,
     Status,
 )
-from scp_mpc.solver.active_set import ActiveSetSolver
-from scp_mpc.solver.trusted import TrustedSolver
+from scp_mpc.qp.backend import ProgramSolver
+from scp_mpc.qp.osqp import OSQP
+from scp_mpc.qp.others import PIQP
+
+SOLVERS = pytest.mark.parametrize("solver", ["osqp", "piqp"])
 
 # 1. Covariances
 
@@ -98,8 +101,8 @@ def test_02_nan_and_infinity_are_refused_before_the_solver(where, bad, monkeypat
     step = good()
     step[where] = np.where(np.arange(4) == 2, bad, step[where])
     with monkeypatch.context() as patch:
-        for engine in (ActiveSetSolver, TrustedSolver):
-            patch.setattr(engine, "solve", lambda *_: pytest.fail("the solver was asked"))
+        for call in ("solve", "rank"):
+            patch.setattr(ProgramSolver, call, lambda *_: pytest.fail("the solver was asked"))
         with pytest.raises(NotFiniteError, match=where):
             mpc.step(**step)
     untouched = MPC(problem(N))
@@ -119,10 +122,10 @@ def test_02_predictions_with_nan_cannot_be_made(bad):
 
 
 @pytest.mark.parametrize("inflation", ["exact", "axes"])
-@pytest.mark.parametrize("condense", [True, False])
-def test_03_an_obstacle_on_the_robot_and_coincident_obstacles(inflation, condense):
+@SOLVERS
+def test_03_an_obstacle_on_the_robot_and_coincident_obstacles(inflation, solver):
     case = problem(N, inflation, max_obstacles=3)
-    settings = Settings(condense=condense)
+    settings = Settings(solver=solver)
     for present in ([ON_TOP], [ON_TOP, ON_TOP], [WALL[0], WALL[0], ON_TOP], WALL):
         solve_and_hold(case, REF[0], REF, present, settings)
 
@@ -181,28 +184,28 @@ def test_04_what_vanishes_is_kept_and_grows():
 # 5. Programs that were not solved
 
 
-@pytest.mark.parametrize("condense", [True, False])
+@SOLVERS
 @pytest.mark.parametrize(
     "settings",
     [{"max_iterations": 1}, {"deadline": 1e-6}, {"deadline": 1e-6, "multi_start": False}],
 )
-def test_05_hurried_plans_say_what_they_are(settings, condense):
+def test_05_hurried_plans_say_what_they_are(settings, solver):
     """Infeasible (an obstacle on the robot, a closed way) and non-convex ones among them."""
     case = problem(N, max_obstacles=2)
     for present in ([ON_TOP], WALL, [obstacle(N, (1.5, 0.0))], [obstacle(N, (2.0, 0.3))]):
-        solve_and_hold(case, REF[0], REF, present, Settings(condense=condense, **settings))
+        solve_and_hold(case, REF[0], REF, present, Settings(solver=solver, **settings))
 
 
-@pytest.mark.parametrize("condense", [True, False])
+@SOLVERS
 @pytest.mark.parametrize("first", [True, False], ids=["at once", "later"])
-def test_05_no_input_comes_from_a_program_without_a_solution(condense, first, monkeypatch):
+def test_05_no_input_comes_from_a_program_without_a_solution(solver, first, monkeypatch):
     """All solvers give up, at the first step or after a good one."""
     case = problem(N)
-    mpc = MPC(case, Settings(condense=condense))
+    mpc = MPC(case, Settings(solver=solver))
     if not first:
         assert mpc.step(**good()).ok
-    monkeypatch.setattr(ActiveSetSolver, "_search", lambda *_: None)
-    monkeypatch.setattr(TrustedSolver, "solve", lambda *_, **__: None)
+    for backend in (OSQP, PIQP):
+        monkeypatch.setattr(backend, "run", lambda *_: None)
     for _ in range(2 * N):
         plan = mpc.step(**good())
         hold(case, *good().values(), plan)
@@ -226,18 +229,24 @@ def test_05_obstacles_far_from_the_first_plan_are_not_forgotten(iterations, side
     solve_and_hold(case, x0, goal, present, settings)
 
 
-@pytest.mark.parametrize("garbage", [NAN, INF, 2143289344.0, 1e300])
-def test_05_a_solver_that_returns_garbage_is_not_believed(garbage, monkeypatch):
-    case = problem(N)
-    search = ActiveSetSolver._search
+@SOLVERS
+@pytest.mark.parametrize("garbage", [NAN, INF, 2143289344.0, 1e300, -1e300])
+def test_05_a_solver_that_returns_garbage_is_not_believed(garbage, solver, monkeypatch):
+    case, asked = problem(N), []
 
-    def lying(self, *given):
-        end = search(self, *given)
-        return None if end is None else (np.full_like(end[0], garbage), 0 * end[1] + garbage)
+    def lying(run):
+        def lie(self, effort):
+            asked.append(effort)
+            point = run(self, effort)
+            return None if point is None else tuple(np.full_like(p, garbage) for p in point)
 
-    monkeypatch.setattr(ActiveSetSolver, "_search", lying)
+        return lie
+
+    for backend in (OSQP, PIQP):
+        monkeypatch.setattr(backend, "run", lying(backend.run))
     with np.errstate(all="ignore"):
-        plan = SCP(case).solve(*good().values())
+        plan = SCP(case, Settings(solver=solver)).solve(*good().values())
+    assert asked
     hold(case, *good().values(), plan)
 
 
@@ -245,18 +254,18 @@ def test_05_a_solver_that_returns_garbage_is_not_believed(garbage, monkeypatch):
 
 
 class Slow:
-    """Makes every dense program take a while."""
+    """Makes every run of OSQP take a while."""
 
     def __init__(self, monkeypatch, seconds):
         self.calls = 0
-        search = ActiveSetSolver._search
+        run = OSQP.run
 
-        def slow(solver, *given):
+        def slow(solver, effort):
             self.calls += 1
             time.sleep(seconds)
-            return search(solver, *given)
+            return run(solver, effort)
 
-        monkeypatch.setattr(ActiveSetSolver, "_search", slow)
+        monkeypatch.setattr(OSQP, "run", slow)
 
 
 def test_06_a_slow_solver_is_stopped_at_the_deadline(monkeypatch):
@@ -292,13 +301,13 @@ def test_06_overruns_are_counted(monkeypatch):
 # 7. Limits
 
 
-@pytest.mark.parametrize("condense", [True, False])
+@SOLVERS
 @pytest.mark.parametrize(
     ("low", "high"), [(-3.0, 3.0), (-0.1, 2.0), (0.3, 0.9), ([-2, 1], [-1, 1]), (0.0, 0.0)]
 )
-def test_07_inputs_are_within_limits_whatever_the_status(low, high, condense):
+def test_07_inputs_are_within_limits_whatever_the_status(low, high, solver):
     case = problem(N, u_min=low, u_max=high, max_obstacles=2)
-    for settings in (Settings(condense=condense), Settings(condense=condense, max_iterations=1)):
+    for settings in (Settings(solver=solver), Settings(solver=solver, max_iterations=1)):
         mpc = MPC(case, settings)
         for k, present in enumerate(([ON_TOP], WALL, [], WALL)):
             plan = mpc.step(REF[0], REF, present)

@@ -5,7 +5,7 @@ import pytest
 from instances import problem, straight_reference
 
 from scp_mpc import MPC, DoubleIntegrator, Iterate, ShapeError, Trajectory
-from scp_mpc.solver import Multipliers
+from scp_mpc.scp import Multipliers
 from scp_mpc.trajectory import rollout
 
 N, M = 5, 2

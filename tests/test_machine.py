@@ -32,12 +32,12 @@ from scp_mpc import (
     Status,
     TooManyObstaclesError,
 )
-from scp_mpc.solver.active_set import ActiveSetSolver
+from scp_mpc.qp.backend import ProgramSolver
 
 SETTINGS = {
     "plain": Settings(),
     "one side": Settings(multi_start=False),
-    "sparse": Settings(condense=False, multi_start=False),
+    "piqp": Settings(solver="piqp", multi_start=False),
     "late": Settings(deadline=1e-6),  # so early that every step is late in the same way
     "short": Settings(max_iterations=2),
 }
@@ -96,14 +96,14 @@ class Control(RuleBasedStateMachine):
     @rule()
     def late(self):
         """The solver dawdles; time may not matter to what is found unless there is a deadline."""
-        search = ActiveSetSolver._search
+        solve = ProgramSolver.solve
 
         def slow(solver, *given):
             time.sleep(1e-4)
-            return search(solver, *given)
+            return solve(solver, *given)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(ActiveSetSolver, "_search", slow)
+            patch.setattr(ProgramSolver, "solve", slow)
             mine = self.mpc.step(*self.step.given)
         self.check(mine, self.twin.step(*self.step.given))
 

@@ -19,7 +19,7 @@ from scp_mpc.control.preview import Preview
 from scp_mpc.robots.riccati import lqr_gain, lqr_weight, terminal_weight
 
 FREE = {"u_min": -1e6, "u_max": 1e6, "max_obstacles": 0}
-PATHS = [Settings(), Settings(condense=False)]
+PATHS = [Settings(), Settings(solver="piqp")]
 PLANE = DoubleIntegrator(0.2)
 
 

@@ -21,7 +21,7 @@ from scp_mpc import (
 )
 from scp_mpc.safety import NoGoSets, containment_size, risk_bound, size_at_risk
 from scp_mpc.safety.allocation import reallocated
-from scp_mpc.solver.commitment import point_risks
+from scp_mpc.scp.risk import point_risks
 
 S95 = 5.991**0.5
 
@@ -156,10 +156,10 @@ def test_plans_commit_to_no_more_than_promised(delta, nodes_per_interval):
 
 def test_an_interval_answers_for_the_points_at_both_ends():
     plan = solved(StageRisk(0.05), 4)
-    step, iterate = plan.commitment.args
-    path = step.sampling.positions(iterate.states, iterate.inputs)
+    step, iterate = plan.step, plan.iterate
+    path = step.nodes.positions(iterate.states, iterate.inputs)
     points = point_risks(step, path)
-    K = step.sampling.count
+    K = step.nodes.count
     for i in range(15):
         own = points[:, i * K : (i + 1) * K].sum(axis=1)
         before = points[:, i * K - 1] if i else 0.0

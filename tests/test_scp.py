@@ -1,10 +1,11 @@
 """The sequential convex programming: optimal, feasible at every iterate, warm, and honest."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from instances import DT, KINDS, S_REF, instance, obstacle, problem, rotated, straight_reference
+from instances import DT, KINDS, S_REF, instance, obstacle, problem, straight_reference
 from judge import judge as judged
 
 from scp_mpc import (
@@ -113,7 +114,8 @@ def test_plans_obey_the_dynamics_the_bounds_and_the_no_go_sets(inflation):
         assert np.linalg.norm(y / semi) >= 1 - 1e-6  # both sets contain the report's ellipse
 
 
-def test_warm_start_cuts_qp_iterations(monkeypatch):
+@pytest.mark.parametrize("kind", ["ahead", "elongated"])
+def test_warm_start_cuts_qp_iterations(kind, monkeypatch):
     """From the shifted plan with its multipliers, OSQP needs a fraction of the cold count."""
     counts, run = [], OSQP.run
 
@@ -122,28 +124,32 @@ def test_warm_start_cuts_qp_iterations(monkeypatch):
         return run(self, effort)
 
     monkeypatch.setattr(OSQP, "run", counting)
-    case = instance("beside", 30, "exact", S_REF, 0)
+    case = instance(kind, 30, "exact", S_REF, 1)
     settings = Settings(multi_start=False, qp=QPSettings(rescue=False))
     solver = SCP(case.problem, settings)
     plan = solver.solve(case.x0, case.x_ref, case.obstacles)
     cold = sum(counts)
     counts.clear()
-    x = case.problem.model.step(case.x0, plan.u0)
-    moved = obstacle(30, tuple(case.obstacles[0].means[1]), (0.1, 0.0), rotated((0.2, 0.15), 0.4))
+    x, there = case.problem.model.step(case.x0, plan.u0), case.obstacles[0]
+    moved = replace(there, means=there.means + there.means[1] - there.means[0])
     guess = plan.iterate.shifted(case.problem.model)
-    solver.solve(x, case.x_ref + [0.4, 0, 0, 0], [moved], guess)
+    again = solver.solve(x, case.x_ref + [0.4, 0, 0, 0], [moved], guess)
     warm = sum(counts)
+    assert plan.status is again.status is Status.CONVERGED
     assert 0 < warm < cold / 2
 
 
 def test_more_tolerance_takes_fewer_programs():
-    case = instance("ahead", 30, "exact", S_REF, 0)
+    """In sum: the last step of Newton's may lead from above both to below both."""
     counts = []
     for tolerance in (1e-3, 1e-6):
-        solver = SCP(case.problem, Settings(multi_start=False, tolerance=tolerance))
-        plan = solver.solve(case.x0, case.x_ref, case.obstacles)
-        assert plan.kkt.worst <= tolerance
-        counts.append(plan.iterations)
+        counts.append(0)
+        for kind in KINDS:
+            case = instance(kind, 30, "exact", S_REF, 0)
+            solver = SCP(case.problem, Settings(multi_start=False, tolerance=tolerance))
+            plan = solver.solve(case.x0, case.x_ref, case.obstacles)
+            assert plan.kkt.worst <= tolerance
+            counts[-1] += plan.iterations
     assert counts[0] < counts[1]
 
 
@@ -308,7 +314,8 @@ def test_a_rival_must_lead_and_safety_comes_first():
     assert not end(0.1, Status.SOFTENED).beats(end(9.0), lead=0.0)
 
 
-def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
+@pytest.mark.parametrize("aside", [-1.0, 1.0])
+def test_a_leap_that_costs_more_is_taken_back(aside, monkeypatch):
     """Half-spaces about a point a metre off the mark: the plan must be as good as without."""
     case = instance("ahead", 20, "exact", S_REF, 0)
     settings = Settings(multi_start=False, max_iterations=300)
@@ -321,7 +328,7 @@ def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
 
     def astray(at, convex, leaps):  # noqa: ARG001
         ahead = convex.condensed.y(convex.solution.v)
-        ahead[at.layout.p][1::2] += 1.0
+        ahead[at.layout.p][1::2] += aside
         return convex.solution, ahead
 
     def counting(self, *trial):
@@ -334,7 +341,7 @@ def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
     plan = SCP(case.problem, settings).solve(*given)
     assert rejected
     assert expected.status is plan.status is Status.CONVERGED
-    assert plan.cost == pytest.approx(expected.cost, rel=1e-6)
+    assert plan.cost <= expected.cost * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("which", range(4))

@@ -20,7 +20,7 @@ from scp_mpc import (
 )
 from scp_mpc.obstacles import Polytope, aged
 from scp_mpc.safety import AxesInflation, ExactInflation, NoGoSets, risk_bound
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.step import Step
 
 N = 5
 INFLATIONS = {"exact": ExactInflation(S_REF), "axes": AxesInflation(S_REF)}
@@ -116,12 +116,14 @@ def test_who_is_near_is_found(seed):
     """`within` leaves out nobody whose no-go set is nearer than the distance."""
     rng, predictions, _, _, _, _ = scene(seed)
     case = problem(N, max_obstacles=4)
-    step = StepData.read(case, np.zeros(4), np.zeros(4), predictions, 0.01 * np.eye(2))
+    step = Step.read(case, np.zeros(4), np.zeros(4), predictions, 0.01 * np.eye(2))
     path, s = 2 * rng.normal(size=(N + 1, 2)), rng.uniform(0.5, 4.0, 4)
     for gap in (0.0, 0.5, 2.0):
         near = step.within(path, s, gap)
         near = np.zeros((3, N), dtype=bool) if near is None else near
-        g = case.no_go.linearise(step.sets, path[1:], s, step.start).value[:3]
+        given = step.means[:, 1:], step.covariances[:, 1:], step.radii, step.count, step.shapes
+        before = path[None, :-1] - step.means[:, :-1]
+        g = case.no_go.linearise(NoGoSets.stacked(*given), path[1:], s[:3], before).value
         assert near[g <= gap - 1e-12].all()
         assert not near[g > gap + 3.0].any()
     known = rng.random((3, N)) < 0.5

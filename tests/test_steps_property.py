@@ -13,10 +13,10 @@ from scp_mpc import SCP, Settings
 KINDS = [
     Settings(),
     Settings(multi_start=False, max_iterations=1),
-    Settings(condense=False, multi_start=False),
-    Settings(condense=False, max_iterations=1),
+    Settings(solver="piqp", multi_start=False),
+    Settings(solver="piqp", max_iterations=1),
     Settings(deadline=1e-6),
-    Settings(condense=False, deadline=1e-6),
+    Settings(solver="piqp", deadline=1e-6),
 ]
 
 
@@ -45,7 +45,7 @@ def test_in_the_plane(data):
     hold(problem, data.draw(steps(problem)), Settings())
 
 
-@pytest.mark.parametrize("settings", KINDS[1:], ids=["one", "sparse", "sparse one", "no time", "-"])
+@pytest.mark.parametrize("settings", KINDS[1:], ids=["one", "piqp", "piqp one", "no time", "-"])
 @profile(90)
 @given(st.data())
 def test_in_the_plane_with_other_settings(settings, data):

@@ -18,6 +18,7 @@ Notation:
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
@@ -27,6 +28,7 @@ from scipy.optimize import nnls
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 
 _ACCURACY = 1e-9  # of a constraint, in its own unit
+_HELD = 1e-8  # the same at the end, after the last system
 _SHARE = 0.5  # of the worst: who is no better goes along
 _PULL = 1e-10  # of the largest force: a force the wrong way that is none
 _POOR = 1e-4  # of the largest pivot: too little for a factor of the squares to be exact
@@ -57,6 +59,11 @@ class CondensedQP:
     unbox: FloatArray
     cap: FloatArray | None = None
     least: float = 0.0
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        """F and A (nf + K, nv), one below the other."""
+        return np.concatenate([self.F, self.A])
 
     def merit(self, v: FloatArray) -> float:
         """Cost at v (nv,) and what it pays for constraints that yield."""
@@ -165,7 +172,7 @@ def solve_on(qp: CondensedQP, active: IntArray, capped: BoolArray) -> QPSolution
         return QPSolution(v, force, active, capped, none, indices, np.zeros((0, 0)))
     split = int(np.searchsorted(indices, nf))
     bounds, spaces = indices[:split], indices[split:] - nf
-    rows = np.concatenate([qp.F[bounds], qp.A[spaces]])
+    rows = qp.rows[indices]
     at = np.where(active[bounds] < 0, qp.lower[bounds], qp.upper[bounds])
     wanted = np.concatenate([at, qp.b[spaces]]) - rows @ v
     factor, strength, info = dposv(rows @ rows.T, wanted)
@@ -184,60 +191,138 @@ def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -
     """Whether all forces push the right way, and all constraints that do not yield hold."""
     if (solution.force * solution.active).max(initial=0.0) > 0.0:
         return False
-    return _violations(qp, solution)[0].max(initial=0.0) <= tolerance
+    depth = _violations(qp, solution.v)[0]
+    return bool(np.where(solution.capped, 0.0, depth).max(initial=0.0) <= tolerance)
 
 
-def settled(
-    qp: CondensedQP, active: IntArray, capped: BoolArray, repairs: int
-) -> tuple[QPSolution, int] | None:
-    """The program's solution, if this active set leads to it; and how many systems that took.
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """What became of a guess of the active set.
 
-    One wrong constraint spoils the forces of its neighbours, so that only the worst are changed at
-    a time: who pulls the hardest leaves, or, if nobody pulls, who is violated the most joins.
+    Attributes:
+        solution: The program's; None if it was not reached.
+        systems: Linear systems solved on the way: 1 if the guess was right.
+        infeasible: Whether there is no solution, for certain.
+    """
+
+    solution: QPSolution | None
+    systems: int
+    infeasible: bool = False
+
+
+def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) -> Settled:
+    """Go from a guess of the active set to the program's solution: a dual active-set method.
+
+    First, who pulls leaves: one wrong constraint spoils the forces of its neighbours, so that only
+    the worst leave at a time. Then forces are admissible, and who is violated the most joins; those
+    whose force it takes away leave on the way (Goldfarb and Idnani, 1983). A force that reaches its
+    cap stays there, and its constraint yields.
 
     Args:
         qp: The program.
         active: (nf + K,) guess, as in `QPSolution`.
         capped: (nf + K,) guess of those that yield.
-        repairs: Changes of the guess at most.
+        changes: Systems to solve at most, beyond the first.
     """
-    for solves in range(1, repairs + 2):
-        solution = solve_on(qp, active, capped)
-        force, active, capped = solution.force, solution.active.copy(), capped.copy()
-        if not np.isfinite(solution.v.sum()):
-            return None
+    solution, systems = solve_on(qp, active, capped), 1
+    while np.isfinite(solution.v @ solution.v):
+        force, active = solution.force, solution.active
         pull = np.where(capped, 0.0, force * active)
-        depth, side = _violations(qp, solution)
-        over = relieved = np.zeros(0)
-        if qp.cap is not None:
-            over = np.where(capped | (pull >= 0), 0.0, np.abs(force) - qp.cap * (1 + 1e-9))
-            relieved = np.where(capped, -depth, 0.0)
-            depth = np.where(capped, 0.0, depth)
-        worst_pull = pull.max(initial=0.0)
-        if worst_pull > _PULL * np.abs(force).max(initial=1.0):
-            active[pull >= _SHARE * worst_pull] = 0
-        elif over.max(initial=0.0) > 0:
-            capped[over > 0] = True
-        elif relieved.max(initial=0.0) > _ACCURACY:
-            capped[relieved >= _SHARE * relieved.max()] = False
-        elif depth.max(initial=0.0) > _ACCURACY:
-            joins = (depth >= _SHARE * depth.max()) & (active == 0)
-            if not joins.any():
-                return None
-            active[joins] = side[joins]
+        worst = pull.max(initial=0.0)
+        if worst > _PULL * np.abs(force).max(initial=1.0):
+            active = np.where(pull >= _SHARE * worst, 0, active)
+        elif qp.cap is not None and (np.abs(force) > qp.cap * (1 + _PULL)).any():
+            capped = capped | (np.abs(force) > qp.cap * (1 + _PULL))
         else:
-            return replace(solution, force=np.where(pull > 0, 0.0, force)), solves
-    return None
+            return _joined(qp, solution, systems, changes + 1)
+        if systems > changes:
+            break
+        solution, systems = solve_on(qp, active, capped), systems + 1
+    return Settled(None, systems)
 
 
-def _violations(qp: CondensedQP, solution: QPSolution) -> tuple[FloatArray, IntArray]:
+def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> Settled:
+    """Let violated constraints join, from a solution whose forces are admissible."""
+    active, capped = solution.active.copy(), solution.capped.copy()
+    force, v = np.abs(solution.force), solution.v.copy()
+    cap = np.full(len(force), np.inf) if qp.cap is None else qp.cap
+    while True:
+        depth, side = _violations(qp, v)
+        depth = np.where(capped, -depth, np.where(active != 0, 0.0, depth))
+        p = int(depth.argmax())
+        if depth[p] <= _ACCURACY:
+            if systems > 1:  # rounding of all the steps goes, and the factor comes
+                solution = solve_on(qp, active, capped)
+            wrong = np.where(solution.capped, 0.0, solution.force * solution.active)
+            if wrong.max(initial=0.0) > 0:  # no more than rounding, or the vertex is degenerate
+                solution = replace(solution, force=np.where(wrong > 0, 0.0, solution.force))
+                if wrong.max() > _PULL * np.abs(solution.force).max(initial=1.0):
+                    return Settled(None, systems)
+            return Settled(solution if holds(qp, solution, _HELD) else None, systems)
+        yields = capped[p]  # and its force is to fall, for there is room
+        if not yields:
+            active[p] = side[p]
+        capped[p] = False
+        others = active != 0
+        others[p] = False
+        while True:
+            if systems >= most:
+                return Settled(None, systems)
+            systems += 1
+            W = (others & ~capped).nonzero()[0]
+            N = -active[W, None] * qp.rows[W]
+            n = -active[p] * qp.rows[p] * (-1.0 if yields else 1.0)
+            r = np.zeros(0)
+            if len(W):
+                _, r, info = dposv(N @ N.T, N @ n)
+                if info != 0:
+                    return Settled(None, systems)
+            z = n - r @ N
+            reach = float(z @ n)
+            gap = _gap(qp, v, p, int(active[p]), bool(yields))
+            whole = gap / reach if reach > _DEPENDENT * float(n @ n) else np.inf
+            with np.errstate(divide="ignore", invalid="ignore"):
+                leave = np.where(r > 0, force[W] / r, np.inf)
+                stop = np.where(r < 0, (cap[W] - force[W]) / -r, np.inf)
+            own = force[p] if yields else cap[p] - force[p]
+            length = min(whole, leave.min(initial=np.inf), stop.min(initial=np.inf), own)
+            if length == np.inf:
+                return Settled(None, systems, infeasible=True)
+            v += length * z
+            force[W] = np.maximum(force[W] - length * r, 0.0)
+            force[p] += -length if yields else length
+            if length == whole:
+                others[p] = True
+                break
+            if length == own:
+                capped[p], force[p] = not yields, 0.0 if yields else cap[p]
+                if yields:
+                    active[p] = 0
+                break
+            if length == leave.min(initial=np.inf):
+                j = W[int(leave.argmin())]
+                active[j], force[j], others[j] = 0, 0.0, False
+            else:
+                j = W[int(stop.argmin())]
+                capped[j], force[j] = True, cap[j]
+
+
+def _gap(qp: CondensedQP, v: FloatArray, p: int, side: int, yields: bool) -> float:
+    """How much a constraint still lacks, or has too much of where it yields."""
+    nf, value = len(qp.F), float(qp.rows[p] @ v)
+    bound = qp.b[p - nf] if p >= nf else (qp.lower[p] if side < 0 else qp.upper[p])
+    lacks = (bound - value) * -side
+    return -lacks if yields else lacks
+
+
+def _violations(qp: CondensedQP, v: FloatArray) -> tuple[FloatArray, IntArray]:
     """By how much each constraint (nf + K,) is violated, negative if it holds; and at which side."""
-    nf, v = len(qp.F), solution.v
-    bounded = qp.F @ v
+    nf, values = len(qp.F), qp.rows @ v
+    bounded = values[:nf]
     below, above = qp.lower - bounded, bounded - qp.upper
-    depth, side = np.empty(len(solution.force)), np.full(len(solution.force), -1, dtype=np.intp)
+    depth, side = np.empty(len(values)), np.full(len(values), -1, dtype=np.intp)
     np.maximum(below, above, out=depth[:nf])
-    depth[nf:] = qp.b - qp.A @ v
+    depth[nf:] = qp.b - values[nf:]
     side[:nf][above > below] = 1
     return depth, side
 
@@ -264,12 +349,12 @@ def _independent(
     rank = int(np.count_nonzero(pivots > _DEPENDENT * pivots[0]))
     along = solve_triangular(R[:rank, :rank], wanted[order[:rank]], trans=1)
     point = Q[:, :rank] @ along
+    keep, force = order[:rank], solve_triangular(R[:rank, :rank], along)
     if rank == len(rows):
-        return order, R, solve_triangular(R, along), point
-    force, missed = nnls((rows * sign[:, None]).T, point, maxiter=30 * len(rows))
-    keep = np.flatnonzero(force)
-    if missed > _ACCURACY * max(1.0, float(np.linalg.norm(point))) or not len(keep):
-        keep = order[:rank]
-        force[keep] = sign[keep] * solve_triangular(R[:rank, :rank], along)
-    R = qr(rows[keep].T, mode="r")[0][: len(keep)]
-    return keep, R, sign[keep] * force[keep], point
+        return keep, R, force, point
+    met = np.flatnonzero(np.abs(rows @ point - wanted) <= _ACCURACY)
+    push, missed = nnls((rows[met] * sign[met, None]).T, point, maxiter=30 * len(rows))
+    if missed > _ACCURACY * max(1.0, float(np.linalg.norm(point))) or not push.any():
+        return keep, R[:rank, :rank], force, point
+    keep, force = met[push > 0], (sign[met] * push)[push > 0]
+    return keep, qr(rows[keep].T, mode="r")[0][: len(keep)], force, point

@@ -113,10 +113,11 @@ class ProgramSolver:
                 break
             self.point = point
             end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
-            if end is not None:
-                self._count(self.backend.name, end[1])
-                return end[0]
-            if qp.proves_infeasible(rows.forces(point[1])):
+            if end.solution is not None:
+                direct = end.systems <= _DIRECT
+                self.finished[self.backend.name if direct else "repaired"] += 1
+                return end.solution
+            if end.infeasible or qp.proves_infeasible(rows.forces(point[1])):
                 self.finished["infeasible"] += 1
                 return None
         if not rescue or self._rescue is None:
@@ -128,10 +129,8 @@ class ProgramSolver:
         self.point = point
         (_, repairs), noise = self._rescue.stages[0], self._rescue.noise
         end = settled(qp, *rows.active(point[1], noise), repairs)
-        if end is None:
-            return None
-        self.finished["piqp"] += 1
-        return end[0]
+        self.finished["piqp"] += end.solution is not None
+        return end.solution
 
     def rank(
         self, qp: CondensedQP, rows: Rows, start: tuple[FloatArray, FloatArray], limit: float
@@ -161,9 +160,6 @@ class ProgramSolver:
                 break
         self.finished["cut" if bound == inf else "ranked"] += 1
         return bound, start
-
-    def _count(self, name: str, solves: int) -> None:
-        self.finished[name if solves <= _DIRECT else "repaired"] += 1
 
 
 def backend(

@@ -99,7 +99,7 @@ class Backend(ABC):
 
     name: str
     noise: float = 1e-7
-    stages: tuple[tuple[int, int], ...] = ((1, 8),)
+    stages: tuple[tuple[int, int], ...] = ((1, 20),)
 
     @abstractmethod
     def load(self, start: tuple[FloatArray, FloatArray]) -> None:
