@@ -1,10 +1,10 @@
 """Who solves a program, and how far that is believed: the solver asked, the exact solve, the rescue.
 
-    repeat:  run the solver a little further        (OSQP: 10, 15, 25, .. iterations)
-             the signs of its multipliers            -> a guess of the active set
-             solve exactly on it, check all rows     -> solution, or a better guess (active_set.py)
-    until    a guess holds, or the multipliers prove that there is no solution, or the budget is up
-    rescue:  PIQP, judged in the same way
+repeat:  run the solver a little further        (OSQP: 10, 15, 25, .. iterations)
+the signs of its multipliers            -> a guess of the active set
+solve exactly on it, check all rows     -> solution, or a better guess (active_set.py)
+until    a guess holds, or the multipliers prove that there is no solution, or the budget is up
+rescue:  PIQP, judged in the same way
 """
 
 from collections import Counter

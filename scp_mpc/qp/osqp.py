@@ -55,7 +55,9 @@ class OSQP(Backend):
         data, lower, upper = self._scaled()
         solver = osqp.OSQP(algebra="builtin")
         solver.setup(
-            sparse.csc_matrix((self._P[self._upper] * self._weights, (row, column)), program.P.shape),
+            sparse.csc_matrix(
+                (self._P[self._upper] * self._weights, (row, column)), program.P.shape
+            ),
             self._columns * self._q,
             sparse.csc_matrix((data, program.A.indices, program.A.indptr), program.A.shape).copy(),
             lower,

@@ -78,9 +78,7 @@ class QuadraticProgram:
         return KKTResiduals(float(gradient), max(0.0, float(violation)), float(product))
 
 
-def bounded(
-    lower: FloatArray, upper: FloatArray, far: float
-) -> tuple[FloatArray, FloatArray]:
+def bounded(lower: FloatArray, upper: FloatArray, far: float) -> tuple[FloatArray, FloatArray]:
     """Bounds (m,) with finite ones, that far from the other side, for those that are none."""
     none, nothing = lower == -inf, upper == inf
     most = np.where(nothing, np.where(none, 0.0, lower) + far, upper)

@@ -194,7 +194,12 @@ class Condenser:
 
     def __init__(self, problem: Problem, nodes: Nodes, layout: Layout) -> None:
         """Condense the problem of a linear robot once and for all."""
-        self._problem, self._model, self._nodes, self._layout = problem, problem.model, nodes, layout
+        self._problem, self._model, self._nodes, self._layout = (
+            problem,
+            problem.model,
+            nodes,
+            layout,
+        )
         N, nu = layout.shape
         self._effort = np.kron(np.eye(N), 2 * problem.R)
         self.linear = isinstance(problem.model, LinearModel)

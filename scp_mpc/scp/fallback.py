@@ -10,10 +10,10 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
-from scp_mpc.scp.plan import Result, Status
-from scp_mpc.scp.iterate import Iterate
 from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.robots.linear import LinearModel
+from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.plan import Result, Status
 from scp_mpc.scp.step import Step
 
 _AT_REST = 1e-9  # of an input, in its own unit, that is none

@@ -22,15 +22,15 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.qp.program import KKTResiduals
 from scp_mpc.scp.candidates import Passing, same_way
 from scp_mpc.scp.certificate import BENT, Nominal, with_curvature
-from scp_mpc.scp.iterate import NEGLIGIBLE, Iterate
-from scp_mpc.scp.newton import corrected, downhill, refined
 from scp_mpc.scp.history import Record
+from scp_mpc.scp.iterate import NEGLIGIBLE
+from scp_mpc.scp.newton import corrected, downhill, refined
 from scp_mpc.scp.plan import Result, Status
-from scp_mpc.scp.trust_region import Region
 from scp_mpc.scp.transcription import Convex, Relaxation, Transcription
-from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.scp.trust_region import Region
 
 _PATIENCE = 3  # iterations before a rival is given up
 _FAR = 1.1  # share of the goal's merit above which it is
@@ -139,9 +139,7 @@ class Loop:
         merit = at.merit(nominal.cost, slack, nominal.excess)
         soft = relaxation is Relaxation.EVERYBODY
         iterate = at.iterate(nominal, problem.slack_weight if soft else inf)
-        return Result(
-            iterate, nominal.cost, merit, residuals, status, iterations, nominal, history
-        )
+        return Result(iterate, nominal.cost, merit, residuals, status, iterations, nominal, history)
 
     def _vain(self, iteration: int, trial: Nominal, goal: Result) -> bool:
         """Whether a run is too far above the goal, or about to end just there."""
@@ -155,9 +153,7 @@ class Loop:
         there = at.nodes.positions(other.states, other.inputs)
         return same_way(at.step, mine, Passing(there, other.touched[: at.step.count]))
 
-    def _record(
-        self, nominal: Nominal, trial: Nominal, convex: Convex, accepted: bool
-    ) -> Record:
+    def _record(self, nominal: Nominal, trial: Nominal, convex: Convex, accepted: bool) -> Record:
         change = trial.rollout.inputs - nominal.rollout.inputs
         at, planes, pairs = self._at, convex.planes, convex.pairs
         solver = (at.elastic if convex.relaxation else at.firm).solver

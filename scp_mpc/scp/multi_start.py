@@ -228,4 +228,3 @@ def _best(ways: list[Ranked]) -> list[Ranked]:
         if len(beam) < _BEAM and np.isfinite(way.merit) and not alike:
             beam.append(way)
     return beam
-

@@ -40,9 +40,7 @@ _LESS = 1e-9  # relative fall of the merit that is none
 _STRIDE = 4.0  # steps to look ahead where they lead away; its powers if they still do
 
 
-def refined(
-    at: Transcription, convex: Convex, leaps: int
-) -> tuple[QPSolution, FloatArray | None]:
+def refined(at: Transcription, convex: Convex, leaps: int) -> tuple[QPSolution, FloatArray | None]:
     """Go on from a convex step to Newton's, as far as its active set carries.
 
     Args:

@@ -55,9 +55,7 @@ class Motion:
 
     def covers(self, other: "Motion") -> bool:
         """Whether another motion stays within these bounds."""
-        return bool(
-            (other.chord <= self.chord).all() and (other.deviation <= self.deviation).all()
-        )
+        return bool((other.chord <= self.chord).all() and (other.deviation <= self.deviation).all())
 
 
 class Nodes(ABC):
@@ -184,9 +182,7 @@ class LinearNodes(Nodes):
         K, d = instants, len(self._position)
         maps = [model.between(k / (2 * K)) for k in range(2 * K + 1)]
         by_x, by_u = (np.array([m[part] for m in maps]) for part in (0, 1))
-        self._C, self._D = (
-            part[2:-1:2].reshape(-1, part.shape[2]) for part in (by_x, by_u)
-        )
+        self._C, self._D = (part[2:-1:2].reshape(-1, part.shape[2]) for part in (by_x, by_u))
         bend_x, bend_u = (part[1::2] - (part[:-1:2] + part[2::2]) / 2 for part in (by_x, by_u))
         self._bend = bend_x.reshape(K * d, -1).T, bend_u.reshape(K * d, -1).T
         none = np.zeros(model.nu) if most is None else most

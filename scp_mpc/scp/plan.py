@@ -5,12 +5,12 @@ from enum import Enum
 from functools import cached_property
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.scp.risk import PlanRisk, plan_risk
-from scp_mpc.scp.step import Step
+from scp_mpc.qp.program import KKTResiduals
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record
 from scp_mpc.scp.iterate import Iterate, Multipliers
-from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.scp.risk import PlanRisk, plan_risk
+from scp_mpc.scp.step import Step
 
 
 class Status(Enum):

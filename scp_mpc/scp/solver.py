@@ -1,13 +1,13 @@
 """The solver of one control step: puts the loop, its starts and what lies below it together.
 
-    free plan, which ignores the obstacles: if it is clear of them, nothing can be better
-    nominal = previous plan, shifted (or the free plan)
-    loop:       half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
-                residual of the original problem is below the tolerance, or the time is up
-    multi-start: where an obstacle shapes the plan, the same from paths on its other sides;
-                the best plan wins, if by enough
-    allocate:   where a joint risk is promised, give it to those who need it, and go on
-    fallback:   without a plan that meets every constraint, the previous one, or braking
+free plan, which ignores the obstacles: if it is clear of them, nothing can be better
+nominal = previous plan, shifted (or the free plan)
+loop:       half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
+residual of the original problem is below the tolerance, or the time is up
+multi-start: where an obstacle shapes the plan, the same from paths on its other sides;
+the best plan wins, if by enough
+allocate:   where a joint risk is promised, give it to those who need it, and go on
+fallback:   without a plan that meets every constraint, the previous one, or braking
 """
 
 import logging

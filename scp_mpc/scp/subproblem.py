@@ -297,7 +297,9 @@ class Subproblem:
             blocks.add("along inputs", space[:, :inner], control, 0.0)
         if layout.moving:
             s = self._s.start + sizes
-            blocks.add("slopes", space.reshape(-1, 1), np.broadcast_to(s, (space.size, len(s))), 0.0)
+            blocks.add(
+                "slopes", space.reshape(-1, 1), np.broadcast_to(s, (space.size, len(s))), 0.0
+            )
         if self.elastic:
             pins = np.arange(self._pins.start, self._pins.stop)
             blocks.add("pins", pins, np.arange(self._below.start, self._slack.stop), 1.0)

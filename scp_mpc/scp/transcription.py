@@ -149,9 +149,7 @@ class Transcription:
         force = np.zeros(len(pairs.node))
         if iterate.multipliers is not None:
             duals = iterate.multipliers
-            reaction = -self.layout.gathered(
-                duals.margin, duals.inputs, duals.rates, duals.states
-            )
+            reaction = -self.layout.gathered(duals.margin, duals.inputs, duals.rates, duals.states)
             force = -duals.obstacles[pairs.obstacle, pairs.node]
         none = np.zeros(len(force), dtype=np.bool_)
         return self.certify(y, rollout, reaction, pairs, force, none)
@@ -178,9 +176,7 @@ class Transcription:
         capped: BoolArray,
     ) -> Nominal:
         """See `Certificate.certify`."""
-        return self._certificate.certify(
-            y, rollout, reaction, pairs, force, capped, self.bounds
-        )
+        return self._certificate.certify(y, rollout, reaction, pairs, force, capped, self.bounds)
 
     def reached(self, convex: Convex, solution: QPSolution) -> Nominal:
         """Roll a solution out and certify it against the original problem."""
@@ -221,9 +217,7 @@ class Transcription:
         """The same plan with other pairs, which include those that push."""
         capped = nominal.pairs.table(nominal.slack > 0)[pairs.obstacle, pairs.node]
         force = nominal.pairs.table(nominal.force)[pairs.obstacle, pairs.node]
-        return self.certify(
-            nominal.y, nominal.rollout, nominal.reaction, pairs, force, capped
-        )
+        return self.certify(nominal.y, nominal.rollout, nominal.reaction, pairs, force, capped)
 
     def with_pairs(self, nominal: Nominal, pairs: Pairs) -> Nominal:
         """The same plan as a start for programs with other pairs; not certified for them."""
@@ -504,4 +498,3 @@ class Transcription:
         whole = np.zeros((self.layout.variables,) * 2)
         whole[:n, :n] = back.T @ W @ back
         return whole
-

@@ -11,7 +11,6 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.qp.active_set import QPSolution
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.transcription import Convex, Relaxation, Transcription
 
