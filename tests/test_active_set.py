@@ -1,4 +1,4 @@
-"""The active-set solver against another QP solver, with and without yielding half-spaces."""
+"""The exact solve on a guessed active set and its repair, against Clarabel and linear programming."""
 
 from dataclasses import replace
 
@@ -7,19 +7,28 @@ import pytest
 import qpsolvers
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 from scipy.sparse import csc_matrix
 
-from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram
+from scp_mpc.qp.active_set import CondensedQP, holds, settled, solve_on
+
+PLENTY = 1000  # changes of the active set
+SEEDS = st.integers(0, 10_000)
+SIZES = st.sampled_from([(12, 0, 6), (40, 0, 4), (6, 0, 10), (8, 5, 4), (5, 12, 3)])
 
 
-def program(seed, n=12, K=6, far=False):
-    """Random bounds about zero and half-spaces that the origin violates, met by some point."""
+def program(seed, n=12, more=0, K=6, far=False):
+    """Random bounds about zero and half-spaces that the origin violates, met by some point.
+
+    Besides the square box of n entries there are `more` bounded entries.
+    """
     rng = np.random.default_rng(seed)
-    F, A = rng.normal(size=(n, n)) / np.sqrt(n), rng.normal(size=(K, n)) / np.sqrt(n)
+    F, A = rng.normal(size=(n + more, n)) / np.sqrt(n), rng.normal(size=(K, n)) / np.sqrt(n)
     inside = rng.normal(size=n) * (3.0 if far else 0.5)
-    lower = np.minimum(F @ inside, 0.0) - rng.uniform(0, 0.3, n)
-    upper = np.maximum(F @ inside, 0.0) + rng.uniform(0, 0.3, n)
-    return F, CondensedProgram(F, lower, upper, A, A @ inside - rng.uniform(0, 0.1, K))
+    lower = np.minimum(F @ inside, 0.0) - rng.uniform(0, 0.3, n + more)
+    upper = np.maximum(F @ inside, 0.0) + rng.uniform(0, 0.3, n + more)
+    b = A @ inside - rng.uniform(0, 0.1, K)
+    return CondensedQP(F, lower, upper, A, b, np.linalg.inv(F[:n]), least=0.7)
 
 
 def yielding(p, cap):
@@ -27,165 +36,306 @@ def yielding(p, cap):
     return replace(p, cap=np.concatenate([np.full(len(p.F), np.inf), np.full(len(p.b), cap)]))
 
 
-def clarabel(P, q, G, h):
-    return qpsolvers.solve_qp(csc_matrix(P), q, csc_matrix(G), h, solver="clarabel")
-
-
-def oracle(F, p, cap=None):
-    """Solve the same program with Clarabel; with slack at `cap` per metre if given."""
-    n, K = F.shape[1], len(p.b)
-    if cap is None:
-        G, h = np.vstack([F, -F, -p.A]), np.concatenate([p.upper, -p.lower, -p.b])
-        return clarabel(np.eye(n), np.zeros(n), G, h)
-    P, q = np.zeros((n + K, n + K)), np.concatenate([np.zeros(n), np.full(K, cap)])
+def oracle(p):
+    """Solve the same program with Clarabel, a slack for each constraint that yields."""
+    n = p.F.shape[1]
+    cap = np.full(len(p.F) + len(p.b), np.inf) if p.cap is None else p.cap
+    soft = np.isfinite(cap)
+    k = int(soft.sum())
+    E = np.zeros((len(cap), k))
+    E[soft] = np.eye(k)
+    bounds, spaces = E[: len(p.F)], E[len(p.F) :]
+    P = np.zeros((n + k, n + k))
     P[:n, :n] = np.eye(n)
-    none = np.zeros((len(F), K))
-    G = np.block([[F, none], [-F, none], [-p.A, -np.eye(K)], [np.zeros((K, n)), -np.eye(K)]])
-    h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(K)])
-    z = clarabel(P, q, G, h)
+    G = np.block(
+        [[p.F, -bounds], [-p.F, -bounds], [-p.A, -spaces], [np.zeros((k, n)), -np.eye(k)]]
+    )
+    h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(k)])
+    q = np.concatenate([np.zeros(n), cap[soft]])
+    some = np.abs(h) < 1e20
+    z = qpsolvers.solve_qp(
+        csc_matrix(P), q, csc_matrix(G[some]), h[some], solver="clarabel",
+        tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-11,
+    )  # fmt: skip
     return None if z is None else z[:n]
 
 
-def check(F, p, held, cap=np.inf):
+def check(p, solution, tolerance=1e-7):
     """The KKT conditions, spelt out."""
-    rows = np.vstack([F, p.A])
-    force = held.force
-    np.testing.assert_allclose(held.v, force @ rows, atol=1e-7 * (1 + np.abs(force).max()))
-    bounded, gap = F @ held.v, p.A @ held.v - p.b
-    assert (bounded >= p.lower - 1e-8).all()
-    assert (bounded <= p.upper + 1e-8).all()
-    beta, push = force[: len(F)], force[len(F) :]
-    assert (np.abs(bounded - p.lower)[beta > 1e-9] < 1e-7).all()
-    assert (np.abs(bounded - p.upper)[beta < -1e-9] < 1e-7).all()
-    assert (push >= -1e-9).all()
-    assert (push <= cap * (1 + 1e-9)).all()
-    assert (gap[push < cap] >= -1e-7).all()
-    assert (gap[push > 1e-9] <= 1e-7).all()
+    rows, force, v = np.vstack([p.F, p.A]), solution.force, solution.v
+    nf = len(p.F)
+    cap = np.full(len(force), np.inf) if p.cap is None else p.cap
+    np.testing.assert_allclose(v, force @ rows, atol=tolerance * (1 + np.abs(force).max()))
+    bounded, gap = p.F @ v, p.A @ v - p.b
+    beta, push = force[:nf], force[nf:]
+    assert (push >= 0).all()
+    assert (np.abs(force) <= cap * (1 + 1e-9)).all()
+    firm = np.abs(force) < cap
+    assert (bounded >= p.lower - tolerance)[firm[:nf]].all()
+    assert (bounded <= p.upper + tolerance)[firm[:nf]].all()
+    assert (gap >= -tolerance)[firm[nf:]].all()
+    # Who pushes stands at its bound, or beyond it where it yields.
+    at_lower, at_upper = bounded - p.lower, p.upper - bounded
+    assert (at_lower[beta > 1e-9] < tolerance).all()
+    assert (at_upper[beta < -1e-9] < tolerance).all()
+    assert (gap[push > 1e-9] < tolerance).all()
 
 
-@given(seed=st.integers(0, 10_000), sizes=st.sampled_from([(12, 6), (40, 4), (6, 10)]))
+def cold(p, guess=None, changes=PLENTY):
+    active = np.zeros(len(p.F) + len(p.b), dtype=np.intp) if guess is None else guess
+    return settled(p, active, np.zeros(len(active), dtype=bool), changes)
+
+
+@given(seed=SEEDS, sizes=SIZES)
 def test_agrees_with_another_solver(seed, sizes):
-    F, p = program(seed, *sizes)
-    held = ActiveSetSolver(F.shape[1]).solve(p, np.zeros(sum(sizes), dtype=np.intp))
-    assert held is not None
-    check(F, p, held)
-    # An interior point stops at a duality gap, whose root is the distance.
-    np.testing.assert_allclose(held.v, oracle(F, p), atol=1e-3)
+    p = program(seed, *sizes)
+    end = cold(p)
+    assert end.solution is not None
+    assert not end.infeasible
+    check(p, end.solution)
+    np.testing.assert_allclose(end.solution.v, oracle(p), atol=1e-4)
+    assert p.merit(end.solution.v) == pytest.approx(0.7 + end.solution.v @ end.solution.v / 2)
 
 
-@given(seed=st.integers(0, 10_000))
+@given(seed=SEEDS)
 def test_bounds_may_yield_while_half_spaces_do_not(seed):
     """Some bounds are out of reach; what they pay is their distance times their cap."""
-    F, p = program(seed)
-    rng = np.random.default_rng(seed)
+    p, rng = program(seed), np.random.default_rng(seed)
     soft = np.arange(12) % 3 == 0
     shift = np.where(soft, rng.choice([-4.0, 4.0], 12), 0.0)
     cap = np.where(np.concatenate([soft, np.zeros(6, bool)]), 1.5, np.inf)
     p = replace(p, lower=p.lower + shift, upper=p.upper + shift, cap=cap)
-    held = ActiveSetSolver(12).solve(p, np.zeros(18, dtype=np.intp))
-    assert held is not None
-    beyond = np.maximum(0, np.maximum(p.lower - F @ held.v, F @ held.v - p.upper))
+    solution = cold(p).solution
+    assert solution is not None
+    check(p, solution)
+    beyond = np.maximum(0, np.maximum(p.lower - p.F @ solution.v, p.F @ solution.v - p.upper))
     assert (beyond[~soft] < 1e-8).all()
-    assert (p.A @ held.v >= p.b - 1e-8).all()
-    assert (np.abs(held.force[:12][beyond > 1e-7]) == 1.5).all()
-    assert (np.abs(held.force[:12][soft]) <= 1.5 * (1 + 1e-9)).all()
-    np.testing.assert_allclose(held.v, held.force @ np.vstack([F, p.A]), atol=1e-7)
-    assert p.penalty(held.v) == pytest.approx(1.5 * beyond[soft].sum())
-    z = clarabel_soft(F, p, soft)
-    np.testing.assert_allclose(held.v, z, atol=2e-3)
+    assert (np.abs(solution.force[:12][beyond > 1e-7]) == 1.5).all()
+    paid = p.merit(solution.v) - 0.7 - solution.v @ solution.v / 2
+    assert paid == pytest.approx(1.5 * beyond[soft].sum())
+    np.testing.assert_allclose(solution.v, oracle(p), atol=1e-3)
 
 
-def clarabel_soft(F, p, soft):
-    """The same with a slack for each soft bound."""
-    n, k = 12, int(soft.sum())
-    P = np.zeros((n + k, n + k))
-    P[:n, :n] = np.eye(n)
-    E = np.zeros((n, k))
-    E[soft] = np.eye(k)
-    none = np.zeros((len(p.b), k))
-    G = np.block([[F, -E], [-F, -E], [-p.A, none], [np.zeros((k, n)), -np.eye(k)]])
-    h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(k)])
-    return clarabel(P, np.concatenate([np.zeros(n), np.full(k, 1.5)]), G, h)[:n]
-
-
-@given(seed=st.integers(0, 10_000))
+@given(seed=SEEDS)
 def test_yields_like_an_exact_l1_penalty(seed):
-    F, p = program(seed)
+    p = program(seed)
     tight = yielding(replace(p, b=p.b + 2.0), 3.0)
-    held = ActiveSetSolver(F.shape[1]).solve(tight, np.zeros(18, dtype=np.intp))
-    assert held is not None
-    check(F, tight, held, cap=3.0)
-    np.testing.assert_allclose(held.v, oracle(F, tight, cap=3.0), atol=1e-3)
+    solution = cold(tight).solution
+    assert solution is not None
+    check(tight, solution)
+    np.testing.assert_allclose(solution.v, oracle(tight), atol=1e-3)
 
 
-def test_any_guess_leads_to_the_same_point():
-    rng = np.random.default_rng(0)
-    F, p = program(3)
-    solver = ActiveSetSolver(F.shape[1])
-    cold = solver.solve(p, np.zeros(18, dtype=np.intp))
-    for _ in range(20):
+@pytest.mark.parametrize("cap", [None, 3.0])
+def test_any_guess_leads_to_the_same_point_and_the_right_one_at_once(cap):
+    rng, p = np.random.default_rng(0), program(3)
+    p = p if cap is None else yielding(replace(p, b=p.b + 2.0), cap)
+    reference = cold(p).solution
+    for _ in range(50):
         guess = rng.integers(-1, 2, 18)
         guess[12:] = -np.abs(guess[12:])
-        warm = solver.solve(p, guess)
-        np.testing.assert_allclose(warm.v, cold.v, atol=1e-9)
-    again = solver.solve(p, cold.active)
-    np.testing.assert_array_equal(again.v, cold.v)
+        capped = np.zeros(18, dtype=bool) if cap is None else (guess != 0) & (rng.random(18) < 0.3)
+        capped[:12] = False
+        warm = settled(p, guess, capped, PLENTY).solution
+        np.testing.assert_allclose(warm.v, reference.v, atol=1e-9)
+        np.testing.assert_allclose(warm.force, reference.force, atol=1e-7)
+    again = settled(p, reference.active, reference.capped, 0)
+    assert again.systems == 1
+    np.testing.assert_array_equal(again.solution.v, reference.v)
+    np.testing.assert_array_equal(again.solution.active, reference.active)
 
 
-def test_a_glimpse_is_the_same_point_without_its_forces():
-    F, p = program(5)
-    solver = ActiveSetSolver(F.shape[1])
-    held = solver.solve(p, np.zeros(18, dtype=np.intp))
-    v, pushing = solver.glimpse(p, np.zeros(12, dtype=np.intp))
-    np.testing.assert_allclose(v, held.v, atol=1e-7)
-    np.testing.assert_array_equal(pushing, held.force[12:] > 0)
+@given(seed=SEEDS, sizes=SIZES)
+def test_one_wrong_constraint_is_repaired(seed, sizes):
+    p, rng = program(seed, *sizes), np.random.default_rng(seed)
+    right = cold(p).solution
+    guess = right.active.copy()
+    k = rng.integers(len(guess))
+    guess[k] = 0 if guess[k] else -1
+    end = settled(p, guess, right.capped, PLENTY)
+    assert end.solution is not None
+    np.testing.assert_allclose(end.solution.v, right.v, atol=1e-8)
+
+
+@given(seed=SEEDS, share=st.floats(0.1, 0.9))
+def test_a_budget_is_kept_and_nothing_wrong_leaves(seed, share):
+    p, rng = program(seed, 20, 10, 8), np.random.default_rng(seed)
+    guess = np.where(rng.random(38) < share, rng.choice([-1, 1], 38), 0)
+    guess[30:] = -np.abs(guess[30:])
+    for changes in (0, 1, 3):
+        end = settled(p, guess, np.zeros(38, dtype=bool), changes)
+        assert end.systems <= changes + 2  # the last one only takes rounding away
+        assert not end.infeasible
+        if end.solution is not None:
+            check(p, end.solution)
+
+
+@given(seed=SEEDS, k=st.integers(0, 6))
+def test_solving_on_a_set_is_the_nearest_point_of_its_equations(seed, k):
+    p, rng = program(seed, 8, 3, 5), np.random.default_rng(seed)
+    active = np.zeros(16, dtype=np.intp)
+    active[rng.permutation(16)[:k]] = -1
+    active[:11] *= rng.choice([-1, 1], 11)
+    solution = solve_on(p, active, np.zeros(16, dtype=bool))
+    rows = np.vstack([p.F, p.A])[active != 0]
+    wanted = np.concatenate([np.where(active[:11] < 0, p.lower, p.upper), p.b])[active != 0]
+    nearest = np.linalg.lstsq(rows, wanted)[0] if k else np.zeros(8)
+    np.testing.assert_allclose(solution.v, nearest, atol=1e-8)
+    np.testing.assert_allclose(solution.force @ np.vstack([p.F, p.A]), solution.v, atol=1e-8)
+    assert set(np.flatnonzero(solution.force)) <= set(np.flatnonzero(active))
+    upper = np.triu(solution.factor)
+    np.testing.assert_allclose(upper.T @ upper, rows @ rows.T, atol=1e-9)
+    np.testing.assert_array_equal(solution.indices, np.flatnonzero(active))
+
+
+def test_capped_constraints_push_with_their_cap_wherever_they_are():
+    p = yielding(program(1), 2.0)
+    active, capped = np.zeros(18, dtype=np.intp), np.zeros(18, dtype=bool)
+    active[[0, 13, 14]], capped[[13, 14]] = [1, -1, -1], True
+    solution = solve_on(p, active, capped)
+    assert (solution.force[[13, 14]] == 2.0).all()
+    assert p.F[0] @ solution.v == pytest.approx(p.upper[0])
+    np.testing.assert_array_equal(solution.indices, [0])
+    np.testing.assert_allclose(solution.force @ np.vstack([p.F, p.A]), solution.v, atol=1e-12)
+
+
+def opposed(seed=1):
+    """Two half-spaces that exclude each other."""
+    p = program(seed, far=True)
+    return replace(p, A=np.vstack([p.A[:1], -p.A[:1]]), b=np.array([0.1, 0.1]))
 
 
 def test_what_cannot_be_met_has_no_solution_unless_it_yields():
-    F, p = program(1, far=True)
-    opposed = replace(p, A=np.vstack([p.A[:1], -p.A[:1]]), b=np.array([0.1, 0.1]))
-    solver, nothing = ActiveSetSolver(F.shape[1]), np.zeros(14, dtype=np.intp)
-    assert solver.solve(opposed, nothing) is None
-    assert solver.glimpse(opposed, nothing[:12]) is None
-    held = solver.solve(yielding(opposed, 50.0), nothing)
-    check(F, opposed, held, cap=50.0)
-    assert held.capped.sum() >= 1
+    for seed in range(20):
+        end = cold(opposed(seed))
+        assert end.solution is None
+        assert end.infeasible
+        soft = yielding(opposed(seed), 50.0)
+        solution = cold(soft).solution
+        check(soft, solution)
+        assert solution.capped.sum() >= 1
 
 
-def test_the_same_row_twice_does_no_harm():
-    F, p = program(2)
-    twice = replace(p, A=np.vstack([p.A, p.A]), b=np.tile(p.b, 2))
-    solver = ActiveSetSolver(F.shape[1])
-    once = solver.solve(p, np.zeros(18, dtype=np.intp))
-    held = solver.solve(twice, np.zeros(24, dtype=np.intp))
-    np.testing.assert_allclose(held.v, once.v, atol=1e-7)
-    check(F, twice, held)
+@given(seed=SEEDS, times=st.integers(2, 4))
+def test_the_same_rows_several_times_do_no_harm(seed, times):
+    p = program(seed)
+    many = replace(p, A=np.vstack([p.A] * times), b=np.tile(p.b, times))
+    once, solution = cold(p).solution, cold(many).solution
+    np.testing.assert_allclose(solution.v, once.v, atol=1e-7)
+    check(many, solution)
+    everybody = np.concatenate([once.active[:12], np.tile(once.active[12:], times)])
+    again = cold(many, everybody).solution
+    np.testing.assert_allclose(again.v, once.v, atol=1e-7)
+    check(many, again)
 
 
-def test_bounds_enter_as_they_matter_and_all_are_kept():
-    """The half-spaces push against bounds that neither the guess nor the origin touches."""
-    for n in (30, 150):
-        F, p = program(11, n=n, K=8, far=True)
-        held = ActiveSetSolver(F.shape[1]).solve(p, np.zeros(n + 8, dtype=np.intp))
-        assert (held.active[:n] != 0).any()
-        check(F, p, held)
+def test_a_vertex_that_more_rows_meet_than_it_needs():
+    """All half-spaces go through one point, more of them than there are dimensions."""
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        n, K = 4, 9
+        point, A = rng.normal(size=n), rng.normal(size=(K, n))
+        A *= np.where(A @ point < 0, -1.0, 1.0)[:, None]
+        wide = np.full(n, 1e3)
+        p = CondensedQP(np.eye(n), -wide, wide, A, A @ point, np.eye(n))
+        for guess in (None, np.concatenate([np.zeros(n), -np.ones(K)]).astype(np.intp)):
+            solution = cold(p, guess).solution
+            assert solution is not None
+            check(p, solution)
 
 
-def test_consistent_sees_wrong_forces_and_broken_constraints():
-    F, p = program(4)
-    solver = ActiveSetSolver(F.shape[1])
-    held = solver.solve(p, np.zeros(18, dtype=np.intp))
-    assert solver.consistent(p, held, 1e-9)
-    assert not solver.consistent(p, replace(held, force=-held.force), 1e-9)
-    assert not solver.consistent(p, replace(held, v=np.zeros(12)), 1e-9)
-    beyond = held.v + 10 * F[0] / (F[0] @ F[0])
-    assert not solver.consistent(p, replace(held, v=beyond), 1e-9)
+def test_holds_sees_wrong_forces_and_broken_constraints():
+    p = program(4)
+    solution = cold(p).solution
+    assert holds(p, solution, 1e-8)
+    assert not holds(p, replace(solution, force=-solution.force), 1e-8)
+    assert not holds(p, replace(solution, v=np.zeros(12)), 1e-8)
+    beyond = solution.v + 10 * p.F[0] / (p.F[0] @ p.F[0])
+    assert not holds(p, replace(solution, v=beyond), 1e-8)
 
 
 @pytest.mark.parametrize("cap", [np.inf, 1e3])
 def test_nothing_to_do(cap):
-    F, p = program(0)
-    free = CondensedProgram(F, p.lower - 1, p.upper + 1, np.zeros((0, 12)), np.zeros(0))
-    held = ActiveSetSolver(12).solve(yielding(free, cap), np.zeros(12, dtype=np.intp))
-    assert not held.v.any()
-    assert not held.force.any()
+    p = program(0)
+    free = replace(p, lower=p.lower - 1, upper=p.upper + 1, A=np.zeros((0, 12)), b=np.zeros(0))
+    end = cold(yielding(free, cap))
+    assert end.systems == 1
+    assert not end.solution.v.any()
+    assert not end.solution.force.any()
+
+
+def test_garbage_for_a_guess_ends_without_a_solution_or_with_the_right_one():
+    p = program(0)
+    right = cold(p).solution
+    for guess in (np.ones(18), -np.ones(18), np.tile([-1, 1], 9)):
+        end = cold(p, guess.astype(np.intp), 3)
+        assert end.solution is None or np.allclose(end.solution.v, right.v, atol=1e-7)
+
+
+# Bounds of the optimum, and proofs that there is none
+
+
+@given(seed=SEEDS, scale=st.sampled_from([1e-3, 1.0, 1e3]), cap=st.sampled_from([None, 0.3, 3.0]))
+def test_no_multipliers_bound_the_optimum_from_above(seed, scale, cap):
+    """Whatever the forces, of any sign, the bound is below the optimum; at the solution it is it."""
+    p, rng = program(seed, 8, 3, 4), np.random.default_rng(seed)
+    p = p if cap is None else yielding(replace(p, b=p.b + 1.0), cap)
+    optimum = p.merit(oracle(p))
+    for share in (1.0, 0.3):
+        force = scale * rng.normal(size=15) * (rng.random(15) < share)
+        assert p.dual_bound(force) <= optimum + 1e-7 * max(1.0, optimum)
+    solution = cold(p).solution
+    assert p.dual_bound(solution.force) == pytest.approx(optimum, rel=1e-6)
+    for stretched in (0.5, 1e-3) if cap is None else (0.5,):
+        assert p.dual_bound(stretched * solution.force) == pytest.approx(optimum, rel=1e-6)
+    assert p.dual_bound(np.zeros(15)) == p.least
+
+
+def test_bounds_that_are_none_do_not_push():
+    p = program(0, 8, 3, 4)
+    free = replace(p, lower=np.full(11, -1e30), upper=np.full(11, 1e30))
+    force = np.concatenate([np.random.default_rng(0).normal(size=11), np.zeros(4)])
+    assert free.dual_bound(force) == free.least
+    assert not free.proves_infeasible(force)
+
+
+def farkas(p):
+    """Multipliers of the firm constraints' least largest violation: a proof where it is positive."""
+    n, nf = p.F.shape[1], len(p.F)
+    cap = np.full(nf + len(p.b), np.inf) if p.cap is None else p.cap
+    G, h = np.vstack([p.F, -p.F, -p.A]), np.concatenate([p.upper, -p.lower, -p.b])
+    firm = np.isinf(np.concatenate([cap[:nf], cap]))
+    G = np.hstack([G, -np.ones((len(G), 1))])[firm]
+    limits = [(None, None)] * n + [(0, None)]
+    end = linprog(np.append(np.zeros(n), 1.0), G, h[firm], bounds=limits)
+    assert end.status == 0
+    y = np.zeros(len(firm))
+    y[firm] = -end.ineqlin.marginals
+    return np.concatenate([y[nf : 2 * nf] - y[:nf], y[2 * nf :]]), end.fun
+
+
+@given(seed=SEEDS, shift=st.floats(0.0, 3.0), extra=st.sampled_from([0, 4]))
+def test_only_what_has_no_solution_is_proved_to_have_none(seed, shift, extra):
+    p, rng = program(seed, 5, extra, 4), np.random.default_rng(seed)
+    p = replace(p, b=p.b + shift)
+    proof, violation = farkas(p)
+    there = violation < 1e-9
+    for force in (proof, *rng.normal(size=(20, 9 + extra)), *np.abs(rng.normal(size=(5, 9 + extra)))):
+        assert not (p.proves_infeasible(force) and there)
+    if violation > 1e-6:
+        assert p.proves_infeasible(proof)
+        assert p.proves_infeasible(1e3 * proof)
+        assert p.proves_infeasible(1e-3 * proof)
+        assert not yielding(p, 5.0).proves_infeasible(proof)
+        which = np.arange(9 + extra)  # bounds yield that are not of the box; obstacles do not
+        given_way = replace(p, cap=np.where((which >= 5) & (which < 5 + extra), 2.0, np.inf))
+        assert not (given_way.proves_infeasible(proof) and farkas(given_way)[1] < 1e-9)
+
+
+def test_a_proof_is_found_from_the_multipliers_of_a_solver_on_its_way():
+    """The dual bound of an infeasible program grows without limit."""
+    p = opposed()
+    proof, violation = farkas(p)
+    assert violation > 0.01
+    assert p.proves_infeasible(proof)
+    assert p.dual_bound(proof) > p.least + 1e3 or p.dual_bound(proof) == np.inf

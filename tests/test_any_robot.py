@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 from any_robot import DT, ROBOTS, complaints, scene, start, world
 
-from scp_mpc import MPC, ObstaclePrediction, Problem, Settings
+from scp_mpc import MPC, SCP, ObstaclePrediction, Problem, Settings
 from scp_mpc.robots import KinematicBicycle, Unicycle
 from scp_mpc.simulation.crowds import Crowd
-from scp_mpc.solver import Status
-from scp_mpc.solver.challenge import Challenge
-from scp_mpc.solver.descent import Descent
-from scp_mpc.solver.iterate import Iterate, Multipliers
-from scp_mpc.solver.ladder import Ladder
-from scp_mpc.solver.program import KKTResiduals
-from scp_mpc.solver.sampling import Sampling
+from scp_mpc.scp import Iterate, KKTResiduals, Multipliers, Status
+from scp_mpc.scp.fallback import Fallback
+from scp_mpc.scp.nodes import Nodes
+from scp_mpc.scp.plan import Result
 
 
 def drive(robot, seed, steps=2):
@@ -66,18 +63,20 @@ def test_several_discs_between_samples_without_obstacles(model):
     x = model.state(np.zeros(2), np.array([6.0, 0.0]))
     goal = model.state(np.array([5.0, 0.0]), np.zeros(2))
     mpc.step(x, goal, [far])
-    assert mpc.step(x, goal, []).ok  # the last plan's points are between the samples
-    assert mpc._solver._resolution.fine.sampling.interpolated(np.zeros((0, 4, 2))).shape[0] == 0
+    plan = mpc.step(x, goal, [])
+    assert plan.ok  # the last plan's nodes are between the samples
+    assert plan.slack.shape == (0, 3)
+    assert plan.step.nodes.interpolated(np.zeros((0, 4, 2))).shape == (0, 3 * 4 * 2 + 1, 2)
 
 
-def test_sag_is_that_of_the_path_and_not_of_its_samples():
+def test_deviation_is_that_of_the_path_and_not_of_its_samples():
     problem = car(Unicycle(DT))
     states, inputs = [np.array([0.0, 0.0, 0.0, 3.0])], np.array([[0.0, 2.0], [0.0, -2.0]] * 2)
     for u in inputs:  # turns that cancel from one chord to the next
         states.append(problem.model.step(states[-1], u))
-    sampling = Sampling.of(replace(problem, horizon=4), 1)
+    nodes = Nodes.of(replace(problem, horizon=4, nodes_per_interval=1))
     truth = 3.0 / 2.0 * (1 - np.cos(0.2))  # of an arc of 0.4 rad and 1.5 m radius
-    assert sampling.sag(np.array(states), inputs) == pytest.approx(truth, rel=1e-3)
+    np.testing.assert_allclose(nodes.deviation(np.array(states), inputs), truth, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("slack", "force", "wanted"), [(0, 0, False), (0, 1, True), (1, 0, True)])
@@ -86,27 +85,33 @@ def test_ways_past_are_tried_where_an_obstacle_matters(slack, force, wanted):
     duals = Multipliers(none, none, np.zeros(1), -force * rows, 0 * rows)
     point = Iterate(np.zeros((4, 4)), np.zeros((3, 2)), np.zeros(1), slack * rows, duals)
     residuals = KKTResiduals(1.0, 1.0, 1.0)
-    end = Descent(lambda: point, 0.0, 0.0, residuals, Status.VIOLATING, 1)
-    assert Challenge(car(Unicycle(DT)), Settings()).wanted(end, due=False) is wanted
+    problem = car(Unicycle(DT))
+    for settings, known, expected in (
+        (Settings(), object(), wanted),
+        (Settings(), None, False),  # no program was solved
+        (Settings(multi_start=False), object(), False),
+    ):
+        end = Result(point, 0.0, 0.0, residuals, Status.VIOLATING, 1, known)
+        assert SCP(problem, settings)._multi_start.wanted(end, due=False) is expected
 
 
 def test_the_lesser_violation_counts_states():
     problem = car(Unicycle(DT), x_max=[np.inf, np.inf, np.inf, 1.0])
-    ladder = Ladder(problem, Settings().tolerance)
+    fallback = Fallback(problem, Settings().tolerance)
 
     def end(speed, slack=0.0):
         states = np.zeros((4, 4))
         states[1:, 3] = speed
         point = Iterate(states, np.zeros((3, 2)), np.zeros(1), np.full((1, 3), slack))
         none = KKTResiduals(1.0, 1.0, 1.0)
-        return Descent(lambda: point, 0.0, 0.0, none, Status.VIOLATING, 1)
+        return Result(point, 0.0, 0.0, none, Status.VIOLATING, 1)
 
     fast, slow, unknown = end(5.0), end(2.0), end(np.nan)
-    assert ladder.lesser(fast, slow) is slow
-    assert ladder.lesser(slow, fast) is slow
-    assert ladder.lesser(unknown, fast) is fast
-    assert ladder.lesser(fast, unknown) is fast
-    assert ladder.lesser(end(0.0, 0.5), slow) is slow
+    assert fallback.lesser(fast, slow) is slow
+    assert fallback.lesser(slow, fast) is slow
+    assert fallback.lesser(unknown, fast) is fast
+    assert fallback.lesser(fast, unknown) is fast
+    assert fallback.lesser(end(0.0, 0.5), slow) is slow
 
 
 def test_a_crowds_problem_keeps_the_rest():

@@ -18,9 +18,8 @@ from scp_mpc import (
 )
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.robots import FunctionModel
-from scp_mpc.solver import engine
-from scp_mpc.solver.sweep import Sweep
-from scp_mpc.solver.trust_region import TrustRegion
+from scp_mpc.scp.nodes import LinearNodes
+from scp_mpc.scp.trust_region import Region
 from scp_mpc.trajectory import rollout
 
 N = 12
@@ -49,10 +48,8 @@ def depths(plan, problem, obstacle, fine=20):
 @pytest.mark.parametrize("nodes_per_interval", [1, 4])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_function_that_is_linear_gives_the_linear_plan(seed, nodes_per_interval, monkeypatch):
-    # What bends between two points is measured in other ways for a linear robot.
-    for measured in ("assumed", "sweep"):
-        monkeypatch.setattr(engine.Engine, measured, lambda *_: Sweep(0.35, 0.01))
-    monkeypatch.setattr(engine.Engine, "free_sweep", lambda *_: Sweep(0.35, 0.01))
+    # What bends between two nodes is bounded for all plans where the robot is linear.
+    monkeypatch.setattr(LinearNodes, "most_deviation", 0.0)
     linear = DoubleIntegrator(DT, 2)
 
     def function(x, u):
@@ -104,15 +101,16 @@ def test_a_function_that_is_linear_gives_the_linear_plan(seed, nodes_per_interva
 
 
 def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
-    verdicts, radii, inner = [], [], TrustRegion._accepted
+    verdicts, radii, inner = [], [], Region.accepts
 
-    def watched(self, point, trial, *args):
-        accepted = inner(self, point, trial, *args)
-        verdicts.append((accepted, self._merit(point) - self._merit(trial), trial, args[-1]))
+    def watched(self, nominal, best, trial, *args):
+        accepted = inner(self, nominal, best, trial, *args)
+        worst = np.inf if best is None else nominal.residuals.worst
+        verdicts.append((accepted, self._merit(nominal) - self._merit(trial), trial, worst))
         radii.append(self._radius)
         return accepted
 
-    monkeypatch.setattr(TrustRegion, "_accepted", watched)
+    monkeypatch.setattr(Region, "accepts", watched)
     problem = machine_problem("quadrotor", 20)
     x0, x_ref = np.zeros(9), straight(problem.model, 20)
     x0[[1, 8]] = -1.5, -2.8
@@ -254,8 +252,8 @@ def test_a_model_that_breaks_leaves_inputs_within_bounds(edge):
 def test_misuse_is_refused():
     with pytest.raises(InvalidArgumentError, match="R"):
         SCP(machine_problem("unicycle", 4, R=[0.0, 1.0]))
-    with pytest.raises(InvalidArgumentError, match="condense"):
-        SCP(machine_problem("unicycle", 4), Settings(condense=False))
+    with pytest.raises(InvalidArgumentError, match="solver"):
+        SCP(machine_problem("unicycle", 4), Settings(solver="condensed"))
     with pytest.raises(InvalidArgumentError, match="discs"):
         machine_problem("planar quadrotor", 4, discs=[-0.1, 0.1])
     with pytest.raises(InvalidArgumentError, match="discs"):

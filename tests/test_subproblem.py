@@ -1,185 +1,298 @@
 """The subproblem: fixed pattern, values through index maps, against a slow dense rebuild."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from instances import S_REF, instance, problem
+from instances import S_REF, instance, obstacle, problem, straight_reference
+from machines import MODELS, machine_problem, ride, straight
+from rebuilt import SLOTS, couplings_of, rebuilt
+from solving import solution
 
-from scp_mpc import DoubleIntegrator
-from scp_mpc.solver.iterate import Iterate, Multipliers
-from scp_mpc.solver.sparse_blocks import SparseBlocks
-from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.subproblem import Subproblem
+from scp_mpc import SCP, DoubleIntegrator, Margin, ObstaclePrediction, Settings, Status, Trajectory
+from scp_mpc.obstacles import Polytope
+from scp_mpc.qp.sparse_blocks import SparseBlocks
+from scp_mpc.scp.deadline import Clock
+from scp_mpc.scp.step import Step
+from scp_mpc.scp.transcription import Relaxation, Transcription
+from scp_mpc.trajectory import rollout
 
-
-def dense(problem, step, spaces, soft):
-    """Build the program row by row, the obvious way."""
-    model, N, M = problem.model, problem.horizon, problem.max_obstacles
-    nx, nu, margin = model.nx, model.nu, problem.margin
-    at_x, at_u, at_s, at_slack = 0, N * nx, N * (nx + nu), N * (nx + nu) + M
-    n = at_slack + M * N
-    P, q = np.zeros((n, n)), np.zeros(n)
-    rows, lower, upper = [], [], []
-
-    def row(lo, up, *entries):
-        a = np.zeros(n)
-        for where, what in entries:
-            a[where] += what
-        rows.append(a)
-        lower.append(lo)
-        upper.append(up)
-
-    for i in range(N):
-        weight = problem.Qf if i == N - 1 else problem.Q
-        x = slice(at_x + i * nx, at_x + (i + 1) * nx)
-        u = slice(at_u + i * nu, at_u + (i + 1) * nu)
-        P[x, x], P[u, u] = 2 * weight, 2 * problem.R
-    for j in range(M):
-        P[at_s + j, at_s + j] = 2 * margin.weight
-        q[at_s + j] = -2 * margin.weight * margin.reference
-    if soft:
-        q[at_slack:] = problem.slack_weight
-    for i in range(N):
-        for a in range(nx):
-            entries = [(at_x + i * nx + a, 1.0)]
-            entries += [(at_u + i * nu + b, -model.B[a, b]) for b in range(nu)]
-            before = step.x0 if i == 0 else step.x_ref[i]
-            known = model.A[a] @ before - step.x_ref[i + 1][a]
-            if i > 0:
-                entries += [(at_x + (i - 1) * nx + b, -model.A[a, b]) for b in range(nx)]
-            row(known, known, *entries)
-    for i in range(N):
-        for a in range(nu):
-            row(problem.u_min[a], problem.u_max[a], (at_u + i * nu + a, 1.0))
-    for j in range(M):
-        row(margin.lower, margin.upper, (at_s + j, 1.0))
-    for j in range(M):
-        for i in range(N):
-            entries = [
-                (at_x + i * nx + c, v)
-                for c, v in zip(model.position, spaces.normal[j, i], strict=True)
-            ]
-            entries += [(at_s + j, spaces.slope[j, i]), (at_slack + j * N + i, 1.0)]
-            along = spaces.normal[j, i] @ step.x_ref[i + 1][model.position]
-            row(spaces.offset[j, i] - along, np.inf, *entries)
-    for k in range(M * N):
-        row(0.0, np.inf if soft else 0.0, (at_slack + k, 1.0))
-    return P, q, np.array(rows), np.array(lower), np.array(upper)
+N = 5
+BOUNDED = {"du_min": -0.5, "du_max": [0.6, np.inf], "x_max": [np.inf, 2.0, 0.8, np.inf]}
+BOTH = pytest.mark.parametrize("elastic", [False, True])
 
 
-def random_program(dim=2, soft=False, seed=0):
-    """A subproblem with two slots, one used, filled about random points."""
-    rng = np.random.default_rng(seed)
-    case = instance("crossing", 8, "exact", 0.5, seed)
-    changes = {"max_obstacles": 2, "Qf": [3.0, 0.4, 2.0, 0.1], "u_min": [-1.0, -2.0]}
+def linear(dim=2, **changes):
+    """A linear robot's problem, and two obstacles near to all of its nodes."""
+    rng = np.random.default_rng(dim)
+    values = {"max_obstacles": 2, "Qf": [3.0, 0.4] * dim, "u_min": [-1.0, -2.0, -3.0][:dim]}
+    values |= {"inflation": "exact", "s_min": 0.5}
     if dim == 3:
-        changes = {
-            "model": DoubleIntegrator(0.1, dim=3),
-            "Q": rng.uniform(0, 1, 6),
-            "R": np.ones(3),
-            "max_obstacles": 2,
-        }
-    this = problem(8, "exact", 0.5, **changes)
-    nx = this.model.nx
-    obstacles = case.obstacles if dim == 2 else []
-    step = StepData.read(this, rng.normal(size=nx), rng.normal(size=(9, nx)), obstacles)
-    spaces = step.half_spaces(rng.normal(size=(9, nx)), rng.uniform(1, 3, 2))
-    subproblem = Subproblem(this)
-    subproblem.soft = soft
-    subproblem.write_step(step.x0, step.x_ref)
-    subproblem.write_half_spaces(spaces)
-    return this, step, spaces, subproblem
+        values |= {"model": DoubleIntegrator(0.1, 3), "Q": rng.uniform(0, 1, 6), "R": np.ones(3)}
+    this = problem(N, **(values | changes))
+    things = [
+        ObstaclePrediction(0.3 * rng.normal(size=(N + 1, dim)), 0.04 * np.eye(dim), 0.2)
+        for _ in range(2)
+    ]
+    x_ref = 0.2 * rng.normal(size=(N + 1, 2 * dim))
+    return this, 0.2 * rng.normal(size=2 * dim), x_ref, things
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("soft", [False, True])
-def test_equals_the_dense_rebuild(dim, soft):
-    this, step, spaces, subproblem = random_program(dim, soft)
-    P, q, A, lower, upper = dense(this, step, spaces, soft)
-    program = subproblem.program
-    np.testing.assert_array_equal(program.P.toarray(), P)
-    np.testing.assert_allclose(program.q, q, rtol=1e-15)
-    np.testing.assert_array_equal(program.A.toarray(), A)
-    np.testing.assert_allclose(program.lower, lower, rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(program.upper, upper, rtol=1e-14, atol=1e-14)
+def nonlinear(name, **changes):
+    """A nonlinear robot's problem, and two obstacles near to all of its nodes."""
+    rng = np.random.default_rng(1)
+    this = machine_problem(name, N, max_obstacles=2, **changes)
+    model = this.model
+    things = [
+        ObstaclePrediction(0.3 * rng.normal(size=(N + 1, model.dim)), 0.01 * np.eye(model.dim), 0.2)
+        for _ in range(2)
+    ]
+    x_ref = straight(model, N)
+    return this, x_ref[0] + 0.1 * rng.normal(size=model.nx), x_ref, things
+
+
+CASES = {
+    "plane": linear,
+    "space": lambda **changes: linear(3, **changes),
+    "axes": lambda **changes: linear(inflation="axes", **changes),
+    "bounds": lambda **changes: linear(**BOUNDED, **changes),
+    "fixed size": lambda **changes: linear(margin=Margin.fixed(2.0), **changes),
+    "discs": lambda **changes: nonlinear("unicycle", discs=[-0.2, 0.1, 0.4], **changes),
+    "free size": lambda **changes: nonlinear("bicycle", margin=Margin(2.0, 0.5, 3.0), **changes),
+    **{name: lambda name=name, **changes: nonlinear(name, **changes) for name in MODELS},
+}
+
+
+def about(this, x0, seed=0):
+    """Inputs that leave room to their bounds, and the plan to which they lead."""
+    rng, half = np.random.default_rng(seed), (this.u_max - this.u_min) / 2
+    inputs = (this.u_max + this.u_min) / 2 + 0.2 * half * rng.uniform(-1, 1, (N, this.model.nu))
+    inputs = this.limited(inputs, np.zeros(this.model.nu))
+    return Trajectory(rollout(this.model.step, x0, inputs).states, inputs)
+
+
+def equal(program, expected, tolerance=1e-7):
+    """Compare all values of a program with the rebuild."""
+    found = program.P.toarray(), program.q, program.A.toarray(), program.lower, program.upper
+    for name, mine in zip(("P", "q", "A", "lower", "upper"), found, strict=True):
+        theirs = getattr(expected, name)
+        np.testing.assert_allclose(mine, theirs, rtol=tolerance, atol=tolerance, err_msg=name)
+
+
+@BOTH
+@pytest.mark.parametrize("nodes_per_interval", [1, 3])
+@pytest.mark.parametrize("case", CASES)
+def test_equals_the_dense_rebuild(case, nodes_per_interval, elastic):
+    this, x0, x_ref, things = CASES[case](nodes_per_interval=nodes_per_interval)
+    plan, last = about(this, x0), np.zeros(this.model.nu) if this.limits_rates else None
+    given = x0, x_ref, things
+    program = SCP(this).subproblem(*given, guess=plan, elastic=elastic, u_last=last)
+    assert (program.P.toarray() == program.P.toarray().T).all()
+    couplings = couplings_of(program, this) if elastic else None
+    if elastic:
+        assert min(couplings[0].min(initial=1.0), couplings[1]) > 0
+    equal(program, rebuilt(this, *given, plan.inputs, elastic, last, couplings))
+
+
+@BOTH
+def test_equals_the_dense_rebuild_about_polytopes(elastic):
+    this, x0, x_ref, things = linear()
+    walls = [Polytope.box([0.4, 0.3], angle=0.3).still(N, [0.6, 0.5]), things[0]]
+    plan = about(this, x0)
+    program = SCP(this).subproblem(x0, x_ref, walls, guess=plan, elastic=elastic)
+    couplings = couplings_of(program, this) if elastic else None
+    equal(program, rebuilt(this, x0, x_ref, walls, plan.inputs, elastic, None, couplings))
+
+
+@pytest.mark.parametrize("case", ["plane", "unicycle"])
+def test_the_nearest_obstacles_get_the_slots_and_others_none(case):
+    this, x0, x_ref, _ = CASES[case]()
+    this, rng = replace(this, max_obstacles=5), np.random.default_rng(3)
+    things = [ObstaclePrediction.still(N, 0.4 * rng.normal(size=2), 0.2) for _ in range(5)]
+    plan, solver = about(this, x0), SCP(this)
+    begin = rebuilt(this, x0, x_ref, [], plan.inputs).spaces.start
+    for present in (things, things[:4], things[:2], [far_away(), *things[:1]]):
+        program = solver.subproblem(x0, x_ref, present, guess=plan)
+        near = [thing for thing in present if thing.means[0, 0] < 9.0]
+        whole = rebuilt(this, x0, x_ref, near, plan.inputs)
+        slots = min(len(near), SLOTS)
+        mine, theirs = (
+            A[begin:].reshape(N, -1, A.shape[1]) for A in (program.A.toarray(), whole.A)
+        )
+        assert mine.shape[1] == SLOTS
+        # Sizes are numbered as the obstacles: those are one further where the far one comes first.
+        columns = slice(0, N * (this.model.nx + this.model.nu))
+        np.testing.assert_allclose(mine[:, :slots, columns], theirs[:, :slots, columns], atol=1e-7)
+        assert not mine[:, slots:].any()
+        lower = program.lower[begin:].reshape(N, SLOTS)
+        expected = whole.lower[begin:].reshape(N, -1)
+        np.testing.assert_allclose(lower[:, :slots], expected[:, :slots], atol=1e-7)
+        assert (lower[:, slots:] == -np.inf).all()
+
+
+def far_away():
+    return ObstaclePrediction.still(N, [50.0, 50.0], 0.2)
 
 
 def test_no_zero_is_stored_in_the_hessian():
     """With diagonal weights, one entry for each state, input and size; none for the slack."""
-    N, M = 30, 12
-    P = Subproblem(problem(N, max_obstacles=M)).program.P
-    assert P.nnz == N * 6 + M
+    M = 12
+    ref = straight_reference(30)
+    for s_min, sizes in ((0.5, M), (S_REF, 0)):
+        this = problem(30, "exact", s_min, max_obstacles=M)
+        for elastic in (False, True):
+            P = SCP(this).subproblem(ref[0], ref, elastic=elastic).P
+            assert P.nnz == 30 * 6 + sizes
 
 
-def test_updated_equals_freshly_built_and_keeps_its_pattern():
-    this, step, spaces, fresh = random_program(seed=1)
-    _, other_step, other_spaces, _ = random_program(seed=2)
-    used = Subproblem(this)
-    pattern = used.program.A.indices.copy(), used.program.A.indptr.copy()
-    data = used.program.A.data
-    used.soft = True
-    used.write_step(other_step.x0, other_step.x_ref)
-    used.write_half_spaces(other_spaces)
-    used.soft = False
-    used.write_step(step.x0, step.x_ref)
-    used.write_half_spaces(spaces)
-    for name in ("q", "lower", "upper"):
-        np.testing.assert_array_equal(getattr(used.program, name), getattr(fresh.program, name))
-    np.testing.assert_array_equal(used.program.A.data, fresh.program.A.data)
-    assert used.program.A.data is data
-    np.testing.assert_array_equal(used.program.A.indices, pattern[0])
-    np.testing.assert_array_equal(used.program.A.indptr, pattern[1])
+@BOTH
+@pytest.mark.parametrize("nodes_per_interval", [1, 3])
+@pytest.mark.parametrize("case", ["plane", "bounds", "unicycle", "bicycle"])
+def test_updated_equals_freshly_built_and_keeps_its_pattern(case, nodes_per_interval, elastic):
+    this, x0, x_ref, things = CASES[case](nodes_per_interval=nodes_per_interval)
+    last = np.zeros(this.model.nu)
+    used, given = SCP(this), (x0, x_ref, things, about(this, x0))
+    first = used.subproblem(*given, elastic=elastic, u_last=last)
+    moved = x0 + 0.1
+    for other in (True, False):  # another step, another kind, another number of obstacles
+        used.subproblem(moved, 0 * x_ref, things[1:], about(this, moved, 5), elastic=other)
+    used.solve(moved, x_ref, things[:1])
+    again = used.subproblem(*given, elastic=elastic, u_last=last)
+    fresh = SCP(this).subproblem(*given, elastic=elastic, u_last=last)
+    for program in (again, fresh):
+        for name in ("q", "lower", "upper"):
+            np.testing.assert_array_equal(getattr(program, name), getattr(first, name))
+        for name in ("P", "A"):
+            mine, theirs = getattr(program, name), getattr(first, name)
+            np.testing.assert_array_equal(mine.indices, theirs.indices)
+            np.testing.assert_array_equal(mine.indptr, theirs.indptr)
+            np.testing.assert_array_equal(mine.data, theirs.data)
+    different = used.subproblem(moved, x_ref, things[:1], elastic=elastic)
+    np.testing.assert_array_equal(different.A.indices, first.A.indices)
+    np.testing.assert_array_equal(different.A.indptr, first.A.indptr)
+    np.testing.assert_array_equal(different.P.indices, first.P.indices)
 
 
-def test_pack_and_unpack_are_inverse():
-    this, step, _, subproblem = random_program()
-    rng = np.random.default_rng(0)
-    N, M = 8, 2
-    iterate = Iterate(
-        np.vstack([step.x0, rng.normal(size=(N, 4))]),
-        rng.uniform(-1, 1, (N, 2)),
-        rng.uniform(1, 2, M),
-        rng.uniform(0, 1, (M, N)),
-        Multipliers(
-            rng.normal(size=(N, 4)),
-            rng.normal(size=(N, 2)),
-            rng.normal(size=M),
-            rng.normal(size=(M, N)),
-            rng.normal(size=(M, N)),
-        ),
-    )
-    again = subproblem.unpack(*subproblem.pack(iterate))
-    for name in ("states", "inputs", "s", "slack"):
-        np.testing.assert_allclose(getattr(again, name), getattr(iterate, name), rtol=1e-14)
-    for name in ("dynamics", "inputs", "margin", "obstacles", "slack"):
-        np.testing.assert_array_equal(
-            getattr(again.multipliers, name), getattr(iterate.multipliers, name)
-        )
-    assert this.horizon == N
+def test_what_is_handed_out_is_the_callers_own():
+    this, x0, x_ref, things = linear()
+    solver = SCP(this)
+    expected = solver.solve(x0, x_ref, things)
+    program = solver.subproblem(x0, x_ref, things)
+    for values in (program.P.data, program.q, program.A.data, program.lower, program.upper):
+        values[:] = np.nan
+    np.testing.assert_array_equal(solver.solve(x0, x_ref, things).U, expected.U)
 
 
-def test_unpack_clips_what_rounding_lets_through():
-    this, _, _, subproblem = random_program()
-    z, y = np.full(len(subproblem.program.q), 99.0), np.zeros(len(subproblem.program.lower))
-    high, low = subproblem.unpack(z, y), subproblem.unpack(-z, y)
-    assert (high.inputs == this.u_max).all()
-    assert (low.inputs == this.u_min).all()
-    assert (high.s == 10.0).all()
-    assert (low.s == 0.5).all()
-    assert (low.slack == 0.0).all()
+@pytest.mark.parametrize("solver", ["clarabel", "piqp"])
+@pytest.mark.parametrize("kind", ["ahead", "beside", "crossing", "elongated"])
+@pytest.mark.parametrize("name", ["linear", *MODELS])
+def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
+    case = instance(kind, 8, "exact", 0.5, 1) if name == "linear" else ride(name, kind, 8, 1)
+    scp = SCP(case.problem, Settings(tolerance=1e-9, max_iterations=200))
+    given = case.x0, case.x_ref, case.obstacles
+    plan = scp.solve(*given)
+    assert plan.status.certified
+    program = scp.subproblem(*given, guess=plan.iterate, elastic=not plan.ok)
+    z, y = solution(program, solver)
+    e, u = np.split(z[: 8 * (case.problem.model.nx + plan.U.shape[1])], [8 * plan.X.shape[1]])
+    np.testing.assert_allclose(u, plan.U.ravel(), atol=1e-5)
+    np.testing.assert_allclose(e, (plan.X - case.x_ref)[1:].ravel(), atol=1e-5)
+    if not plan.ok:
+        return
+    value = z @ (program.P @ z) / 2 + program.q @ z
+    idle, size = case.problem.model.idle, case.problem.size
+    constant = 8 * idle @ case.problem.R @ idle
+    if size.lower < size.reference:
+        constant += size.weight * size.reference**2
+    assert value + constant == pytest.approx(plan.cost, rel=1e-6)
+    pushed = -plan.multipliers.obstacles.sum()
+    assert -y[-8:].sum() == pytest.approx(pushed, rel=1e-3, abs=1e-4)
 
 
-def test_the_objective_is_the_problems_cost():
-    this, step, _, subproblem = random_program()
-    rng = np.random.default_rng(3)
-    z, y = rng.uniform(0.5, 1.0, len(subproblem.program.q)), np.zeros(0)
-    iterate = subproblem.unpack(z, np.zeros(len(subproblem.program.lower)))
-    z, y = subproblem.pack(iterate)
-    program = subproblem.program
-    constant = 2 * this.margin.weight * S_REF**2
+def test_at_convergence_an_elastic_one_is_solved_with_the_same_slack():
+    this, ref = problem(8), straight_reference(8, 4.0)
+    blocking = [obstacle(8, (1.2, 0.05), covariance=np.eye(2))]
+    scp = SCP(this, Settings(tolerance=1e-9))
+    plan = scp.solve(ref[0], ref, blocking)
+    assert plan.status is Status.SOFTENED
+    program = scp.subproblem(ref[0], ref, blocking, guess=plan.iterate, elastic=True)
+    coupling = couplings_of(program, this)[1]
+    z, _ = solution(program, "clarabel")
+    np.testing.assert_allclose(z[8 * 4 : 8 * 6], plan.U.ravel(), atol=1e-4)
+    np.testing.assert_allclose(coupling * z[-8:], plan.slack[0], atol=1e-5)
+
+
+def begun(case="bounds", **changes):
+    """A transcription of a step, a plan in it with forces, and its written program."""
+    this, x0, x_ref, things = CASES[case](**changes)
+    at = Transcription(this, Settings(), SCP(this)._nodes)
+    at.begin(Step.read(this, x0, x_ref, things, nodes=at.nodes, u_last=np.zeros(2)), Clock())
+    rng, plan = np.random.default_rng(0), about(this, x0)
+    y, rolled = at.rolled(plan.inputs, rng.uniform(0.5, 2.0, 2))
+    everybody = np.ones(at.step.radii.shape, dtype=bool)
+    pairs = at.renewed(at.plain(plan.inputs), type(at.nobody)(at.step, at.layout, everybody)).pairs
+    reaction = rng.normal(size=at.layout.size - at.layout.boxed.start)
+    force = rng.uniform(size=len(pairs.node))
+    nominal = at.certify(y, rolled, reaction, pairs, force, np.zeros(len(force), dtype=bool))
+    return at, nominal
+
+
+@pytest.mark.parametrize("give", list(Relaxation))
+@pytest.mark.parametrize("case", ["plane", "bounds", "bicycle"])
+def test_a_start_and_what_is_read_from_it_are_inverse(case, give):
+    at, nominal = begun(case)
+    written = at.write(at.condensed(nominal), nominal.pairs, nominal.planes, give)
+    subproblem, rows = written
+    z, y = at.start(subproblem, nominal)
+    inputs, sizes = subproblem.plan(z, nominal.y[at.layout.s])
+    np.testing.assert_array_equal(inputs, nominal.rollout.inputs)
+    np.testing.assert_array_equal(sizes, nominal.y[at.layout.s])
+    np.testing.assert_array_equal(z[: nominal.rollout.deviations.size].reshape(N, -1),
+                                  nominal.rollout.deviations)  # fmt: skip
+    forces = np.concatenate([nominal.reaction, nominal.force])
+    np.testing.assert_array_equal(rows.forces(y), forces)
+    np.testing.assert_array_equal(y[: nominal.costates.size].reshape(N, -1), nominal.costates)
+    active, _ = rows.active(y, 0.0)
+    np.testing.assert_array_equal(active, -np.sign(forces))
+
+
+def test_what_rounding_lets_through_is_clipped():
+    at, _ = begun("plane")
+    this, high = at.problem, np.full((N, 2), 99.0)
+    for inputs, bound in ((high, this.u_max), (-high, this.u_min)):
+        y, rolled = at.rolled(inputs, np.full(2, 99.0 * np.sign(inputs[0, 0])))
+        assert (rolled.inputs == bound).all()
+        assert (at.inputs(y) == bound).all()
+        size = this.size
+        assert (y[at.layout.s] == (size.upper if inputs is high else size.lower)).all()
+
+
+def test_inputs_are_moved_into_their_rates():
+    this = problem(N, du_min=-0.3, du_max=0.2)
+    at = Transcription(this, Settings(), SCP(this)._nodes)
+    last, rng = np.array([1.0, -1.0]), np.random.default_rng(0)
+    at.begin(Step.read(this, np.zeros(4), np.zeros(4), [], nodes=at.nodes, u_last=last), Clock())
+    _, rolled = at.rolled(rng.normal(scale=3.0, size=(N, 2)), np.full(1, S_REF))
+    change = np.diff(np.vstack([last, rolled.inputs]), axis=0)
+    assert (change >= -0.3 - 1e-9).all()
+    assert (change <= 0.2 + 1e-9).all()
+
+
+@pytest.mark.parametrize("case", ["plane", "fixed size", "quadrotor", "bicycle"])
+def test_the_objective_is_the_problems_cost(case):
+    this, x0, x_ref, things = CASES[case]()
+    plan = about(this, x0, 3)
+    program, size, nu = SCP(this).subproblem(x0, x_ref, things, guess=plan), this.size, this.model.nu
+    s = np.random.default_rng(0).uniform(0.5, 3.0, 2)
+    moving = size.lower < size.reference
+    s = s if moving else np.full(2, size.reference)
+    z = np.concatenate([(plan.states - x_ref)[1:].ravel(), plan.inputs.ravel(), s[: 2 * moving]])
+    constant = N * this.model.idle @ this.R @ this.model.idle
+    constant += 2 * moving * size.weight * size.reference**2
     value = z @ (program.P @ z) / 2 + program.q @ z + constant
-    cost = this.cost(iterate.states, iterate.inputs, iterate.s, step.x_ref)
-    assert value == pytest.approx(cost, rel=1e-12)
-    assert y is not None
+    assert len(z) == len(program.q) == N * (this.model.nx + nu) + 2 * moving
+    cost = this.cost(plan.states, plan.inputs, s, x_ref)
+    assert value == pytest.approx(cost, rel=1e-9)
 
 
 def test_blocks_refuse_to_overlap():

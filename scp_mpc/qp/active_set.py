@@ -353,6 +353,8 @@ def _independent(
     if rank == len(rows):
         return keep, R, force, point
     met = np.flatnonzero(np.abs(rows @ point - wanted) <= _ACCURACY)
+    if not len(met):
+        return keep, R[:rank, :rank], force, point
     push, missed = nnls((rows[met] * sign[met, None]).T, point, maxiter=30 * len(rows))
     if missed > _ACCURACY * max(1.0, float(np.linalg.norm(point))) or not push.any():
         return keep, R[:rank, :rank], force, point

@@ -76,7 +76,6 @@ class ProgramSolver:
         finished: Programs by who finished them: the solver, "repaired" where its active set took
             more than one repair, "piqp". And programs that nobody finished: "ranked" by a bound,
             "cut" because that is too high, "infeasible".
-        point: Where the last program ended, x (n,) and y (m,), solved or not.
     """
 
     def __init__(
@@ -88,7 +87,6 @@ class ProgramSolver:
         if settings.rescue and name != "piqp":
             self._rescue = PIQP(program, equations)
         self.finished: Counter[str] = Counter()
-        self.point: tuple[FloatArray, FloatArray] | None = None
 
     def solve(
         self,
@@ -106,12 +104,10 @@ class ProgramSolver:
             rescue: Whether there is time for PIQP.
         """
         self.backend.load(start)
-        self.point = start
         for effort, repairs in self.backend.stages:
             point = self.backend.run(effort)
             if point is None:
                 break
-            self.point = point
             end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
             if end.solution is not None:
                 direct = end.systems <= _DIRECT
@@ -126,7 +122,6 @@ class ProgramSolver:
         point = self._rescue.run(1)
         if point is None:
             return None
-        self.point = point
         (_, repairs), noise = self._rescue.stages[0], self._rescue.noise
         end = settled(qp, *rows.active(point[1], noise), repairs)
         self.finished["piqp"] += end.solution is not None

@@ -34,6 +34,7 @@ from scp_mpc.scp.trust_region import Region
 
 _PATIENCE = 3  # iterations before a rival is given up
 _FAR = 1.1  # share of the goal's merit above which it is
+_SURPLUS = 1e-3  # of the tolerance: worth one more iteration, whose convergence is quadratic
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 
 
@@ -75,7 +76,10 @@ class Loop:
             clock.begin()
             condensed = at.condensed(nominal)
             clock.charge("linearise")
-            convex = at.solve(nominal, condensed, planes, relaxation, firm, region.radius)
+            levels = at.relaxations(firm, relaxation)
+            if leaps:  # nobody yields for the sake of a leap
+                levels = (relaxation,)
+            convex = at.solve(nominal, condensed, planes, levels, region.radius)
             if convex is None and planes is not nominal.planes:
                 planes, leaps, bold = nominal.planes, 0, False  # a leap too far
                 continue
@@ -84,8 +88,13 @@ class Loop:
             relaxation = convex.relaxation
             solution, ahead = refined(at, convex, leaps) if bold else (convex.solution, None)
             trial = at.reached(convex, solution)
-            trial = at.screened(trial) if screen else trial
             clock.charge("linearise")
+            wider = at.screened(trial) if screen else None
+            if wider is not None:  # solve again, with the pairs that were left out and violated
+                own = planes is nominal.planes
+                nominal = at.renewed(nominal, wider)
+                planes = nominal.planes if own else wider.planes(planes.y)
+                continue
             clock.learn("iteration", began)
             began = clock.elapsed
             accepted = region.accepts(nominal, best, trial, convex, solution, leaps)
@@ -105,7 +114,10 @@ class Loop:
             before = inf if best is None else best.residuals.worst
             nominal = best = trial
             planes = trial.planes
-            if trial.residuals.worst <= settings.tolerance:
+            if not (trial.slack.any() or trial.excess.any()):
+                relaxation = Relaxation.NOBODY
+            worst = trial.residuals.worst
+            if worst <= _SURPLUS * settings.tolerance or max(worst, before) <= settings.tolerance:
                 least, direction = at.second_order(trial)
                 best = with_curvature(trial, least)
                 away = downhill(at, trial, direction) if least < -BENT else None

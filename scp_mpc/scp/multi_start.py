@@ -185,8 +185,7 @@ class MultiStart:
         y, rollout = at.rolled(one.inputs, one.sizes)
         nf = len(one.force) - len(pairs.node)
         none = np.zeros(len(pairs.node), dtype=np.bool_)
-        plan = at.certify(y, rollout, one.force[:nf], pairs, one.force[nf:], none)
-        return at.screened(plan)
+        return at.certify(y, rollout, one.force[:nf], pairs, one.force[nf:], none)
 
     def _searched(
         self,

@@ -136,6 +136,10 @@ class Nodes(ABC):
         """
         chord, bend = (np.repeat(part, self.count) for part in (motion.chord, motion.deviation))
         wide: FloatArray = np.hypot(radii + bend, (chord + drift) / 2)
+        intervals, n = self.stages(wide), self.discs
+        # A sample also begins the next interval, and has to leave room for what happens there.
+        ends = intervals[:, :-1, -n:]
+        ends[:] = np.maximum(ends, intervals[:, 1:, :n])
         return wide
 
     def interpolated(self, values: FloatArray, axis: int = 1) -> FloatArray:

@@ -5,7 +5,7 @@ import numpy as np
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.loop import Loop
-from scp_mpc.scp.transcription import Relaxation, Transcription
+from scp_mpc.scp.transcription import Transcription
 
 
 def obstacle_free(at: Transcription, loop: Loop, last: Iterate | None) -> Nominal:
@@ -58,11 +58,11 @@ def _linear(at: Transcription, last: Iterate | None) -> Nominal:
     if last is not None and not last.touches:
         none = np.zeros(at.step.radii.shape, dtype=np.bool_)
         start = at.at(last, none)
-    convex = at.solve(start, condensed, start.planes, Relaxation.NOBODY, firm=True)
+    convex = at.solve(start, condensed, start.planes, at.relaxations(firm=True))
     return start if convex is None else at.reached(convex, convex.solution)
 
 
 def _one_program(at: Transcription, start: Nominal) -> Nominal:
     condensed = at.condensed(start)
-    convex = at.solve(start, condensed, start.planes, Relaxation.NOBODY, firm=True)
+    convex = at.solve(start, condensed, start.planes, at.relaxations(firm=True))
     return start if convex is None else at.reached(convex, convex.solution)

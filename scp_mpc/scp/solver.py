@@ -102,7 +102,9 @@ class SCP:
         """
         nominal = None if guess is None else as_iterate(guess, self.problem)
         return self.solve_from(
-            x0, x_ref, obstacles, nominal, multi_start, robot_covariance, u_last=u_last
+            *(x0, x_ref, obstacles, nominal, multi_start, robot_covariance),
+            u_last=u_last,
+            path=nominal is not None,
         )
 
     def solve_from(
@@ -115,8 +117,12 @@ class SCP:
         robot_covariance: ArrayLike | None = None,
         clock: Clock | None = None,
         u_last: ArrayLike | None = None,
+        path: bool = False,
     ) -> Plan:
-        """`solve`, with an iterate that is known to fit, and a clock that may run."""
+        """`solve`, with an iterate that is known to fit, and a clock that may run.
+
+        `path` says that its states are a path to linearise about first, wherever its inputs lead.
+        """
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
@@ -125,7 +131,7 @@ class SCP:
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
             )
             try:
-                return self._solve(step, clock, nominal, multi_start)
+                return self._solve(step, clock, nominal, multi_start, path)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
                 return self._plan(step, Found(self._fallback.best(step, nominal)), clock)
@@ -211,7 +217,9 @@ class SCP:
                 way[0], way, [ObstaclePrediction(m, 0.01 * np.eye(model.dim), 0.1) for m in means]
             )
 
-    def _solve(self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool) -> Plan:
+    def _solve(
+        self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool, path: bool
+    ) -> Plan:
         at = self._at
         at.begin(step, clock)
         free = obstacle_free(at, self._loop, last)
@@ -222,7 +230,7 @@ class SCP:
         if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
             at.widen(wide)
             return self._plan(wide, Found(self._loop.result(free)), clock)
-        path = at.path(free.y)[1:]
+        about = at.outputs(last) if path and last is not None else None
         start = at.iterate(free) if last is None else last
         for _ in range(_CORRECTIONS):
             assumed = None
@@ -230,16 +238,16 @@ class SCP:
                 assumed = self._motion(start).reserved(free_motion, self._nodes.most_deviation)
                 wide = self._widened(step, assumed)
             at.widen(wide)
-            best = self._loop.run(at.at(start)) if step.count else None
+            best = self._loop.run(at.at(start, about=about), about=about) if step.count else None
             found = Found(best or self._fallback.best(wide, last))
             if self._multi_start.wanted(found.best, multi_start):
-                found = self._multi_start.run(found.best, path, last is None)
+                found = self._multi_start.run(found.best, at.path(free.y)[1:], last is None)
             found = replace(found, best=allocate(at, self._loop, found.best))
             ending = clock.elapsed
             found = replace(found, best=self._rescued(wide, last, found.best))
             if assumed is None or self._is_kept(step, assumed, found.best):
                 break
-            start = found.best.iterate
+            start, about = found.best.iterate, None
         else:
             found = replace(found, best=self._exposed(step, found.best))
         plan = self._plan(wide, found, clock)

@@ -125,7 +125,6 @@ class Subproblem:
         planes: Planes,
         along: Derivatives,
         yielding: bool = True,
-        room: FloatArray | None = None,
     ) -> Rows:
         """Write the half-spaces of the nearest pairs; return which row is whose.
 
@@ -134,11 +133,10 @@ class Subproblem:
             planes: Their half-spaces.
             along: How positions depend on states and inputs, about the plan of the dynamics.
             yielding: In an elastic program, whether the obstacles may yield, too.
-            room: (K,) how near the pairs are; None for as near as at the planes' point.
         """
         layout, nodes, S, program = self._layout, self._nodes, self._slots, self.program
         d, N, data = self._problem.model.dim, layout.shape[0], self.program.A.data
-        kept, slot = self._assigned(pairs, planes.g if room is None else room)
+        kept, slot = self._assigned(pairs.node, planes.g)
         normal = np.zeros((nodes.size * S, d))
         normal[slot] = planes.a[kept, :d]
         grouped = normal.reshape(N, nodes.count, S, d)
@@ -214,15 +212,9 @@ class Subproblem:
         sizes[: self._layout.moving] = z[self._s]
         return z[self._u].reshape(self._layout.shape), sizes
 
-    def shifted(self, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """A start one control step later: every stage moves up, the last one stays."""
-        if not hasattr(self, "_shift"):
-            self._shift = self._shifts()
-        return start[0][self._shift[0]], start[1][self._shift[1]]
-
-    def _assigned(self, pairs: Pairs, room: FloatArray) -> tuple[IntArray, IntArray]:
+    def _assigned(self, node: IntArray, room: FloatArray) -> tuple[IntArray, IntArray]:
         """Which pairs get a slot, and which: the nearest ones at each node."""
-        node, S = pairs.node, self._slots
+        S = self._slots
         order = np.lexsort((room, node))
         first = np.searchsorted(node[order], node[order])
         rank = np.arange(len(order)) - first
@@ -309,34 +301,6 @@ class Subproblem:
             slack = np.arange(self._slack.start, self._slack.stop)
             blocks.add("slack", space.ravel(), slack, self._coupling[1])
         return blocks.build(shape)
-
-    def _shifts(self) -> tuple[IntArray, IntArray]:
-        """Where entries of z and y are found one control step earlier."""
-        N, layout = self._problem.horizon, self._layout
-        z, y = np.arange(self._slack.stop), np.arange(self._pins.stop)
-        for part in (self._e, self._u, self._below, self._above, self._slack):
-            _shift(z, part, N)
-        bounded = self._bounded.start
-        parts = [self._dynamics, self._spaces]
-        for inner in (
-            layout.inputs,
-            slice(layout.inputs.stop, layout.yielding.start),
-            layout.yielding,
-        ):
-            parts.append(slice(bounded + inner.start, bounded + inner.stop))
-        begin = self._pins.start
-        for part in (self._below, self._above, self._slack):
-            parts.append(slice(begin, begin + part.stop - part.start))
-            begin = parts[-1].stop
-        for part in parts:
-            _shift(y, part, N)
-        return z, y
-
-
-def _shift(places: IntArray, part: slice, stages: int) -> None:
-    size = part.stop - part.start
-    if size:
-        places[part.start : part.stop - size // stages] += size // stages
 
 
 def _slices(sizes: list[int]) -> list[slice]:

@@ -4,6 +4,7 @@ Notation as in `layout.py`, `condensing.py`, `pairs.py` and `certificate.py`.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -25,7 +26,7 @@ from scp_mpc.scp.subproblem import Subproblem
 from scp_mpc.settings import Settings
 
 _TOUCH = 1e-7  # distance to a constraint that counts as none
-_REASSIGNMENTS = 3  # of slots, for one program
+_ROUNDING = 1e-10  # of a bounded entry, in its own unit
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
 
 
@@ -133,17 +134,21 @@ class Transcription:
         e = rollout.deviations
         return self.layout.outputs(self.step, rollout.positions, s, inputs, e), rollout
 
-    def at(self, iterate: Iterate, near: BoolArray | None = None) -> Nominal:
+    def at(
+        self, iterate: Iterate, near: BoolArray | None = None, about: FloatArray | None = None
+    ) -> Nominal:
         """An iterate's inputs, rolled out from the state now, with its multipliers.
 
         Args:
             iterate: The iterate.
             near: (J, C) pairs to look at; None for those near to it.
+            about: (ny,) another point, pairs near to which are to be looked at, too.
         """
         guess = iterate.states[1:] - self.step.x_ref[1:]
         y, rollout = self.rolled(iterate.inputs, iterate.s, guess)
         if near is None:
             near = self.near(y, iterate.touched[: self.step.count])
+            near = near if about is None else self.near(about, near)
         pairs = Pairs(self.step, self.layout, near)
         reaction = np.zeros(self.layout.size - self.layout.boxed.start)
         force = np.zeros(len(pairs.node))
@@ -153,6 +158,12 @@ class Transcription:
             force = -duals.obstacles[pairs.obstacle, pairs.node]
         none = np.zeros(len(force), dtype=np.bool_)
         return self.certify(y, rollout, reaction, pairs, force, none)
+
+    def outputs(self, iterate: Iterate) -> FloatArray:
+        """Y (ny,) of an iterate's own states, which need not be where its inputs lead."""
+        positions = self.nodes.positions(iterate.states, iterate.inputs) - self.step.here
+        e = iterate.states[1:] - self.step.x_ref[1:]
+        return self.layout.outputs(self.step, positions, iterate.s, iterate.inputs, e)
 
     def plain(self, inputs: FloatArray, guess: FloatArray | None = None) -> Nominal:
         """A plan of inputs (N, nu) on which nothing pushes, obstacles left out."""
@@ -182,6 +193,10 @@ class Transcription:
         """Roll a solution out and certify it against the original problem."""
         nf, condensed = len(convex.qp.F), convex.condensed
         y = condensed.y(solution.v)
+        boxed = y[self.layout.boxed]
+        for bound in self.bounds:  # exactly, not nearly
+            near = np.abs(boxed - bound[self.layout.boxed]) <= _ROUNDING
+            boxed[near] = bound[self.layout.boxed][near]
         guess = None if self.linear else condensed.deviations(solution.v)
         y, rollout = self.rolled(self.inputs(y), y[self.layout.s], guess)
         return self.certify(
@@ -203,15 +218,15 @@ class Transcription:
         near = known if more is None else known | more
         return near if near.any() else ~near
 
-    def screened(self, nominal: Nominal) -> Nominal:
-        """The same plan, with pairs that it violates though they were left out."""
+    def screened(self, nominal: Nominal) -> Pairs | None:
+        """The pairs that a plan's program should have held, if it violates one that was left out."""
         path, s, near = self.path(nominal.y), nominal.y[self.layout.s], nominal.pairs.near
         missed = self.step.within(path, s, 0.0, known=near)
         if missed is None:
-            return nominal
+            return None
         more = self.step.within(path, s, _NEAR, known=near)
         near = near | missed if more is None else near | more
-        return self.renewed(nominal, Pairs(self.step, self.layout, near))
+        return Pairs(self.step, self.layout, near)
 
     def renewed(self, nominal: Nominal, pairs: Pairs) -> Nominal:
         """The same plan with other pairs, which include those that push."""
@@ -266,12 +281,8 @@ class Transcription:
         planes: Planes,
         relaxation: Relaxation,
         radius: FloatArray | None = None,
-        room: FloatArray | None = None,
     ) -> tuple[Subproblem, Rows]:
-        """Write the sparse program of the same constraints; return it, and which row is whose.
-
-        `room` (K,) says how near the pairs are: the nearest get the slots.
-        """
+        """Write the sparse program of the same constraints; return it, and which row is whose."""
         elastic = relaxation is not Relaxation.NOBODY
         subproblem = self.elastic if elastic else self.firm
         about = condensed.about
@@ -281,71 +292,42 @@ class Transcription:
             self._written[elastic] = known
         subproblem.write_bounds(*self._box(condensed, radius), self.step.u_last)
         yielding = relaxation is Relaxation.EVERYBODY
-        return subproblem, subproblem.write_half_spaces(pairs, planes, about.along, yielding, room)
+        return subproblem, subproblem.write_half_spaces(pairs, planes, about.along, yielding)
 
     def solve(
         self,
         nominal: Nominal,
         condensed: Condensed,
         planes: Planes,
-        relaxation: Relaxation,
-        firm: bool,
+        relaxations: Sequence[Relaxation],
         radius: FloatArray | None = None,
     ) -> Convex | None:
-        """Solve the convex program about a plan, with planes of its pairs.
-
-        Where it has no solution, the states' bounds give way, and then the obstacles.
+        """Solve the convex program about a plan, with planes of its pairs; None if nobody can.
 
         Args:
             nominal: The plan, and its multipliers to start from.
             condensed: The problem condensed about it.
             planes: Half-spaces of its pairs.
-            relaxation: Who gives way already.
-            firm: Whether obstacles never do.
+            relaxations: Who is to give way, one after the other, until there is a solution.
             radius: As in `convex_qp`.
         """
         pairs, clock = nominal.pairs, self.clock
-        for give in self.relaxations(firm or not len(pairs.node)):
-            if give < relaxation:
-                continue
-            if give > relaxation and clock.remaining < 0:
+        for give in relaxations:
+            if give > relaxations[0] and clock.remaining < 0:
                 break  # it was the time that ran out
             clock.begin()
             qp = self.convex_qp(condensed, pairs, planes, give, radius)
-            solution = self._solved(nominal, condensed, planes, qp, give, radius)
-            if solution is not None:
-                return Convex(condensed, pairs, planes, qp, solution, give)
-        return None
-
-    def _solved(
-        self,
-        nominal: Nominal,
-        condensed: Condensed,
-        planes: Planes,
-        qp: CondensedQP,
-        give: Relaxation,
-        radius: FloatArray | None,
-    ) -> QPSolution | None:
-        """Write a program and have it solved; again, where a pair without a slot was violated."""
-        clock, pairs, room, start = self.clock, nominal.pairs, None, None
-        for _ in range(_REASSIGNMENTS):
-            subproblem, rows = self.write(condensed, pairs, planes, give, radius, room)
+            subproblem, rows = self.write(condensed, pairs, planes, give, radius)
             start = self.start(subproblem, nominal)
             clock.charge("update")
             rescue = clock.unlimited or clock.allows("rescue")
             began = clock.elapsed
             solution = subproblem.solver.solve(qp, rows, start, rescue)
             clock.charge("solve")
-            if solution is not None or subproblem.solver.point is None:
-                return solution
+            if solution is not None:
+                return Convex(condensed, pairs, planes, qp, solution, give)
             if rescue:
                 clock.learn("rescue", began)
-            z, _ = subproblem.solver.point
-            v = qp.unbox @ self.boxed(condensed, *subproblem.plan(z, nominal.y[self.layout.s]))
-            room = qp.A @ v - qp.b
-            left_out = rows.place[len(qp.F) :] < 0
-            if room[left_out].min(initial=0.0) >= -_TOUCH or not clock.allows("iteration"):
-                return None
         return None
 
     def start(self, subproblem: Subproblem, nominal: Nominal) -> tuple[FloatArray, FloatArray]:
@@ -354,10 +336,13 @@ class Transcription:
         s = nominal.y[self.layout.s]
         return subproblem.start(plan.deviations, plan.inputs, s, nominal.costates, force)
 
-    def relaxations(self, firm: bool) -> tuple[Relaxation, ...]:
+    def relaxations(
+        self, firm: bool, least: Relaxation = Relaxation.NOBODY
+    ) -> tuple[Relaxation, ...]:
         """Who is to give way, one after the other: firm obstacles never do."""
         states = (Relaxation.STATES,) if self.layout.limits_states else ()
-        return Relaxation.NOBODY, *states, *(() if firm else (Relaxation.EVERYBODY,))
+        every = (Relaxation.NOBODY, *states, *(() if firm else (Relaxation.EVERYBODY,)))
+        return tuple(give for give in every if give >= least) or (least,)
 
     # --- curvature
 
