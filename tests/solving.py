@@ -1,10 +1,12 @@
-"""Sparse programs solved by others, through qpsolvers."""
+"""Sparse programs solved by others, through qpsolvers; and all half-spaces of a control step."""
 
 import warnings
 
 import numpy as np
 import qpsolvers
 from scipy import sparse
+
+from scp_mpc.safety.no_go import NoGoSets
 
 TIGHT = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
@@ -37,3 +39,12 @@ def solution(program, solver="clarabel"):
     if len(b):
         y[equal] = end.y
     return end.x, y
+
+
+def half_spaces(step, path, s):
+    """Those of all obstacles at all nodes (C, d) of a path, at sizes s (M,)."""
+    sets = NoGoSets.stacked(
+        step.means[:, 1:], step.covariances[:, 1:], step.radii, step.count, step.shapes
+    )
+    start = step.here - step.means[:, 0]
+    return step.problem.no_go.linearise(sets, path, s[: step.count], start)

@@ -37,19 +37,20 @@ KEYS = {
     "horizon",
     "obstacles",
     "steps",
+    "every",
     "median_ms",
     "p99_ms",
     "max_ms",
+    "ratio",
     "max_cost_gap",
     "max_violation",
     "failures",
+    "programs",
 }
 OTHERS = {"fatrop", "sqp-qrqp", "sqp-hpipm", "sqp-osqp"}
 SOLVERS = [
     "scp_mpc",
-    "scp_mpc (both sides)",
-    "scp_mpc (osqp)",
-    "scp_mpc (osqp alone)",
+    "scp_mpc (multi-start)",
     "scp_mpc (piqp)",
     "ipopt",
     "fatrop",
@@ -301,6 +302,7 @@ def test_missing_casadi_keeps_its_row(monkeypatch, tmp_path, caplog):
         "horizon": 8,
         "obstacles": 1,
         "steps": 2,
+        "every": 1,
         "failures": 2,
     }
     assert ours["failures"] == 0

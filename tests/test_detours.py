@@ -7,9 +7,9 @@ from instances import S_REF, problem
 
 from scp_mpc import ObstaclePrediction
 from scp_mpc.obstacles import Polytope
-from scp_mpc.solver.detours import Walls
-from scp_mpc.solver.sides import Passing, candidates, same_way
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.candidates import Passing, candidates, same_way
+from scp_mpc.scp.detours import Walls
+from scp_mpc.scp.step import Step
 
 N = 8
 UP = np.array([0.0, 1.0])
@@ -30,7 +30,7 @@ PATH = np.stack([np.linspace(0.0, 4.0, N), np.zeros(N)], axis=1)
 @pytest.fixture
 def step():
     case = problem(N, max_obstacles=2)
-    return StepData.read(case, np.zeros(4), np.zeros(4), THINGS)
+    return Step.read(case, np.zeros(4), np.zeros(4), THINGS)
 
 
 def walls(step, *slots):
@@ -60,7 +60,7 @@ def test_points_within_go_straight_to_the_side_and_no_others(step, side):
 def test_out_of_one_and_of_what_comes_next():
     boxes = [Polytope.box([1.0, 1.0]).still(N, (0.0, y)) for y in (1.1, 0.0, 2.2)]
     case = problem(N, max_obstacles=3)
-    stack = StepData.read(case, np.zeros(4), np.zeros(4), boxes)
+    stack = Step.read(case, np.zeros(4), np.zeros(4), boxes)
     moved = Walls.of(stack, np.zeros(3), np.arange(3), slice(0, N)).aside(np.zeros((N, 2)), UP)
     np.testing.assert_allclose(moved, np.tile([0.0, 2.85], (N, 1)))
 
@@ -114,7 +114,7 @@ def test_the_two_faces_of_a_long_wall_are_two_sides():
     """Seen from its middle both lie in almost the same direction."""
     wall = Polytope.box([0.2, 20.0]).still(N, (2.0, 0.0))
     case = problem(N, max_obstacles=1)
-    step = StepData.read(case, np.zeros(4), np.zeros(4), [wall])
+    step = Step.read(case, np.zeros(4), np.zeros(4), [wall])
     touched = np.ones((1, N), dtype=bool)
     left, right, up = (
         Passing(np.tile(p, (N, 1)), touched) for p in ([1.7, 9.0], [2.3, 9.0], [1.7, -9.0])

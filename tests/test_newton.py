@@ -11,7 +11,6 @@ from scp_mpc import (
     SCP,
     DoubleIntegrator,
     ObstaclePrediction,
-    QPSettings,
     Settings,
     Status,
     Trajectory,
@@ -19,19 +18,29 @@ from scp_mpc import (
 from scp_mpc.safety import NoGoSets
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation
 from scp_mpc.safety.tangents import inverse_root, tangents
-from scp_mpc.solver import newton
-from scp_mpc.solver.active_set import ActiveSetSolver, CondensedProgram
-from scp_mpc.solver.curvature import summed
-from scp_mpc.solver.step_data import StepData
-from scp_mpc.solver.stopwatch import Stopwatch
+from scp_mpc.qp.active_set import CondensedQP, settled
+from scp_mpc.scp import loop
+from scp_mpc.scp.deadline import Clock
+from scp_mpc.scp.loop import Loop
+from scp_mpc.scp.newton import newton_step, summed
+from scp_mpc.scp.nodes import Nodes
+from scp_mpc.scp.step import Step
+from scp_mpc.scp.transcription import Transcription
+
+
+def held_on(A):
+    """The solution of a program whose half-spaces A v >= 1 are all that matters."""
+    k, n = A.shape
+    p = CondensedQP(np.eye(n), np.full(n, -1e3), np.full(n, 1e3), A, np.ones(k), np.eye(n))
+    guess = np.concatenate([np.zeros(n, int), -np.ones(k, int)])
+    return settled(p, guess, np.zeros(n + k, dtype=bool), 100).solution
 
 
 def bent(scale, seed=0, n=8, k=2, q=3):
     """A program's solution, and bends that make the convex steps shrink or grow."""
     rng = np.random.default_rng(seed)
     A, L = rng.normal(size=(k, n)), scale * rng.normal(size=(q, n)) / np.sqrt(n)
-    p = CondensedProgram(np.eye(n), np.full(n, -1e3), np.full(n, 1e3), A, np.ones(k))
-    held = ActiveSetSolver(n).solve(p, np.concatenate([np.zeros(n, int), -np.ones(k, int)]))
+    held = held_on(A)
     return held, L, rng.normal(size=n), np.eye(n) - np.linalg.pinv(held.rows) @ held.rows
 
 
@@ -101,7 +110,7 @@ def test_tangents_complete_a_basis(dim):
 
 def plain(monkeypatch):
     """Take away the sums and the leaps: convex steps only."""
-    monkeypatch.setattr(newton.Newton, "_ahead", lambda *_: None)
+    monkeypatch.setattr(loop, "refined", lambda _, convex, __: (convex.solution, None))
 
 
 @pytest.mark.parametrize("inflation", ["exact", "axes"])
@@ -124,26 +133,18 @@ def test_summed_and_plain_reach_the_same_optimum_the_former_sooner(monkeypatch, 
     assert sum(p.iterations for p in quick) < 0.4 * sum(p.iterations for p in slow)
 
 
-def exact(limit):
-    qp = QPSettings(accuracy=1e-12)
-    return Settings(multi_start=False, tolerance=1e-12, max_iterations=limit, qp=qp)
-
-
 def test_convergence_is_quadratic_at_the_end():
     """From near the optimum, each residual is about the square of the one before."""
     case = instance("ahead", 20, "exact", S_REF, 0)
-    tight = Settings(multi_start=False, tolerance=1e-7)
+    tight = Settings(multi_start=False, tolerance=1e-10)
     plan = SCP(case.problem, tight).solve(case.x0, case.x_ref, case.obstacles)
-    rng = np.random.default_rng(0)
-    X = plan.X.copy()
-    X[1:, [0, 2]] += 0.02 * rng.normal(size=(20, 2))
-    residuals = []
+    rng, residuals = np.random.default_rng(0), []
+    U = case.problem.limited(plan.U + 0.02 * rng.normal(size=plan.U.shape))
     for limit in (1, 2, 3):
-        solver = SCP(case.problem, exact(limit))
-        # The condensed engine alone: the sparse one would take over where this one runs out.
-        step = StepData.read(case.problem, case.x0, case.x_ref, case.obstacles)
-        solver._resolution.coarse.primary.begin(step, Stopwatch())
-        end = solver._resolution.coarse.primary.descend(replace(plan.iterate, states=X), limit)
+        settings = Settings(multi_start=False, tolerance=1e-12, max_iterations=limit)
+        at = Transcription(case.problem, settings, Nodes.of(case.problem))
+        at.begin(Step.read(case.problem, case.x0, case.x_ref, case.obstacles), Clock())
+        end = Loop(at).run(at.at(replace(plan.iterate, inputs=U)))
         residuals.append(end.residuals.worst)
     assert residuals[1] < 20 * residuals[0] ** 1.7
     assert residuals[2] < 1e-9
@@ -169,28 +170,6 @@ def test_leaps_leave_a_saddle_sooner(monkeypatch):
     assert quick.iterations < creeping.iterations
 
 
-def test_a_leap_that_costs_more_is_taken_back(monkeypatch):
-    """Leap a metre aside after every convex step: the plan must be as good as without."""
-    case = instance("ahead", 20, "exact", S_REF, 0)
-    guess = Trajectory(case.x_ref, np.zeros((20, 2)))
-    settings = Settings(multi_start=False, max_iterations=2000)
-    plain(monkeypatch)
-    expected = SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
-    leapt = []
-
-    def astray(self, *given):
-        leapt.append(given)
-        y = self._step.chart.y(given[2].v)
-        y[self._step.layout.p] += 1.0
-        return y
-
-    monkeypatch.setattr(newton.Newton, "_ahead", astray)
-    plan = SCP(case.problem, settings).solve(case.x0, case.x_ref, case.obstacles, guess)
-    assert leapt
-    assert plan.status is Status.CONVERGED
-    assert plan.cost <= expected.cost * (1 + 1e-6)
-
-
 def test_a_spatial_plan_converges_as_quickly():
     model = DoubleIntegrator(DT, dim=3)
     case = problem(15, "exact", 0.5, model=model, Q=[1.0, 0.1] * 3, R=[0.01] * 3)
@@ -202,4 +181,27 @@ def test_a_spatial_plan_converges_as_quickly():
     assert plan.status is Status.CONVERGED
     assert plan.iterate.touches
     assert plan.iterations <= 15
-    assert set(plan.qps) <= {"kkt", "daqp"}
+    assert set(plan.qps) <= {"kkt", "osqp", "repaired"}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_newton_step_solves_the_kkt_system(seed):
+    rng = np.random.default_rng(seed)
+    held = held_on(rng.normal(size=(3, 8)))
+    W = rng.normal(size=(8, 8))
+    W, step = 0.1 * (W + W.T), rng.normal(size=8)
+    rows, k = held.rows, len(held.rows)
+    assert k
+    whole = newton_step(held, step, W)
+    # minimise |v|^2/2 + (v - here)'W(v - here)/2 on the active set, here = held.v - step
+    KKT = np.block([[np.eye(8) + W, -rows.T], [rows, np.zeros((k, k))]])
+    right = np.concatenate([W @ (held.v - step), rows @ held.v])
+    dense = np.linalg.solve(KKT, right)
+    np.testing.assert_allclose(whole.v, dense[:8], atol=1e-9)
+    np.testing.assert_allclose(whole.force[held.indices], dense[8:], atol=1e-9)
+    L = 0.2 * rng.normal(size=(3, 8))
+    other = summed(held, L, L @ step)
+    whole = newton_step(held, step, -L.T @ L)
+    np.testing.assert_allclose(whole.v, other.v, atol=1e-9)
+    np.testing.assert_allclose(whole.force, other.force, atol=1e-9)
+    assert newton_step(held, step, -100 * np.eye(8)) is None

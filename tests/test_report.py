@@ -120,7 +120,7 @@ def test_written_summary_holds_rows_and_provenance(run, tmp_path):
     assert contents["seed"] == 0
     assert contents["inflation"] == "axes"
     assert contents["settings"]["tolerance"] == run.settings.tolerance
-    assert contents["settings"]["qp"]["eps"] == run.settings.qp.eps
+    assert contents["settings"]["qp"]["rho"] == list(run.settings.qp.rho)
     assert contents["margin"]["lower"] == pytest.approx(sqrt(5.991))
     assert {"machine", "cores", "python", "osqp", "commit"} <= set(contents["provenance"])
     text = (tmp_path / "summary.md").read_text()

@@ -29,6 +29,7 @@ from scp_mpc.arrays import BoolArray, FloatArray, IntArray
 
 _ACCURACY = 1e-9  # of a constraint, in its own unit
 _HELD = 1e-8  # the same at the end, after the last system
+_LEAST = 1e-30  # of what forces ask: a pull that is none
 _SHARE = 0.5  # of the worst: who is no better goes along
 _PULL = 1e-10  # of the largest force: a force the wrong way that is none
 _POOR = 1e-4  # of the largest pivot: too little for a factor of the squares to be exact
@@ -85,13 +86,15 @@ class CondensedQP:
         force = self._admissible(force)
         gain, pull = self._asked(force), self._pull(force)
         pull2 = float(pull @ pull)
-        if gain <= 0 or not pull2 > 0:
+        if gain <= 0:
             return self.least
-        stretch = gain / pull2
+        stretch = gain / pull2 if pull2 > _LEAST * gain else np.inf
         if self.cap is not None:
             soft = np.isfinite(self.cap) & (force != 0)
             if soft.any():
                 stretch = min(stretch, float((self.cap[soft] / np.abs(force[soft])).min()))
+        if stretch == np.inf:
+            return np.inf
         return self.least + stretch * gain - stretch * stretch * pull2 / 2
 
     def proves_infeasible(self, force: FloatArray) -> bool:
@@ -224,7 +227,12 @@ def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) 
         capped: (nf + K,) guess of those that yield.
         changes: Systems to solve at most, beyond the first.
     """
-    solution, systems = solve_on(qp, active, capped), 1
+    none = np.append(qp.lower <= -_NONE, np.zeros(len(qp.b), dtype=np.bool_)), np.append(
+        qp.upper >= _NONE, np.ones(len(qp.b), dtype=np.bool_)
+    )
+    active = np.where(((active < 0) & none[0]) | ((active > 0) & none[1]), 0, active)
+    solution, systems = solve_on(qp, active, capped & (active != 0)), 1
+    capped = solution.capped
     while np.isfinite(solution.v @ solution.v):
         force, active = solution.force, solution.active
         pull = np.where(capped, 0.0, force * active)
@@ -286,8 +294,8 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
                 stop = np.where(r < 0, (cap[W] - force[W]) / -r, np.inf)
             own = force[p] if yields else cap[p] - force[p]
             length = min(whole, leave.min(initial=np.inf), stop.min(initial=np.inf), own)
-            if length == np.inf:
-                return Settled(None, systems, infeasible=True)
+            if not length < np.inf:  # or NaN
+                return Settled(None, systems, infeasible=length == np.inf)
             v += length * z
             force[W] = np.maximum(force[W] - length * r, 0.0)
             force[p] += -length if yields else length

@@ -105,7 +105,7 @@ class ProgramSolver:
         """
         self.backend.load(start)
         for effort, repairs in self.backend.stages:
-            point = self.backend.run(effort)
+            point = _run(self.backend, effort)
             if point is None:
                 break
             end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
@@ -119,7 +119,7 @@ class ProgramSolver:
         if not rescue or self._rescue is None:
             return None
         self._rescue.load(start)
-        point = self._rescue.run(1)
+        point = _run(self._rescue, 1)
         if point is None:
             return None
         (_, repairs), noise = self._rescue.stages[0], self._rescue.noise
@@ -145,7 +145,7 @@ class ProgramSolver:
         self.backend.load(start)
         bound = -inf
         for effort, _ in self.backend.stages[:_GLANCES]:
-            point = self.backend.run(effort)
+            point = _run(self.backend, effort)
             if point is None:
                 bound = inf
                 break
@@ -155,6 +155,13 @@ class ProgramSolver:
                 break
         self.finished["cut" if bound == inf else "ranked"] += 1
         return bound, start
+
+
+def _run(solver: Backend, effort: int) -> tuple[FloatArray, FloatArray] | None:
+    """Let a solver go on; None unless it comes to numbers that can be worked with."""
+    point = solver.run(effort)
+    with np.errstate(over="ignore"):
+        return point if point and np.isfinite(point[0] @ point[0] + point[1] @ point[1]) else None
 
 
 def backend(

@@ -36,7 +36,7 @@ class OSQP(Backend):
     """
 
     name = "osqp"
-    noise = 0.0  # ADMM projects: the multiplier of a constraint that is not active is zero
+    noise = 1e-12  # ADMM projects: the multiplier of a constraint that is not active is zero
 
     def __init__(self, program: QuadraticProgram, settings: QPSettings) -> None:
         """Set OSQP up on scaled copies."""
@@ -81,22 +81,28 @@ class OSQP(Backend):
     def load(self, start: tuple[FloatArray, FloatArray]) -> None:
         """See the base class."""
         program, core = self._program, self._core
+        if not np.isfinite(program.A.data).all():
+            _refuse(program.A.data)
         data, lower, upper = self._scaled()
         room = upper - lower
-        if not (room.min() >= 0 and np.isfinite(data @ data) and np.isfinite(room).all()):
-            _refuse(data, lower, upper)
+        if not (room.min() >= 0 and np.isfinite(room).all()):
+            _refuse(lower, upper)
         x, y = start[0] / self._columns, start[1] / self._rows
-        if not np.isfinite(x @ x + y @ y):
+        if not (np.isfinite(x).all() and np.isfinite(y).all()):
             _refuse(x, y)
         if self._runs > 1:
             core.update_rho(self._rhos[0])
         failed = 0
         if not np.array_equal(program.q, self._q):
+            if not np.isfinite(program.q).all():
+                _refuse(program.q)
             self._q = program.q.copy()
             failed |= core.update_data_vec(q=self._columns * self._q, l=None, u=None)
         failed |= core.update_data_vec(q=None, l=lower, u=upper)
         P = None
         if not np.array_equal(program.P.data, self._P):
+            if not np.isfinite(program.P.data).all():
+                _refuse(program.P.data)
             self._P = program.P.data.copy()
             P = self._P[self._upper] * self._weights
         failed |= core.update_data_mat(P_x=P, P_i=None, A_x=data, A_i=None)
@@ -118,7 +124,7 @@ class OSQP(Backend):
         if core.info.status_val not in _POINTS:  # x holds 2143289344.0 then, which is finite
             return None
         x, y = self._columns * core.solution.x, self._rows * core.solution.y
-        return (x, y) if np.isfinite(x @ x + y @ y) else None
+        return x, y
 
     def _scaled(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values of A and the bounds in rows of length one."""
@@ -141,5 +147,6 @@ def _refuse(*vectors: FloatArray) -> None:
         if not np.isfinite(vector).all():
             at = int(np.argmin(np.isfinite(vector)))
             raise NotFiniteError("program", f"{vector[at]} at index {at} is not finite")
-    at = int(np.argmax(vectors[1] > vectors[2]))
-    raise BoundsError("lower", f"{vectors[1][at]} exceeds upper = {vectors[2][at]} at row {at}")
+    lower, upper = vectors
+    at = int(np.argmax(lower > upper))
+    raise BoundsError("lower", f"{lower[at]} exceeds upper = {upper[at]} at row {at}")

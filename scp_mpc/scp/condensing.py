@@ -28,6 +28,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtbtrs, dtrtri
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.scp.layout import Layout
@@ -208,6 +209,8 @@ class Condenser:
             A, B = (np.repeat(M[None], N, axis=0) for M in (problem.model.A, problem.model.B))
             self._always = Derivatives(A, B, *nodes.slopes)
             self._sensitivity = self._sensitivity_along(self._always)
+        elif np.linalg.eigvalsh(problem.R)[0] <= 0:
+            raise InvalidArgumentError("R", "is singular, which a nonlinear model does not allow")
 
     def begin(self, step: Step) -> None:
         """Read a control step."""

@@ -20,17 +20,15 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
     model, N, M = problem.model, problem.horizon, problem.max_obstacles
     if not isinstance(guess, Trajectory | Iterate):
         raise InvalidArgumentError("guess", f"{guess!r} is neither a Trajectory nor an Iterate")
+    nodes = N * len(problem.discs) * problem.nodes_per_interval
     if isinstance(guess, Trajectory):
         s = np.full(M, problem.size.reference)
-        guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, N * len(problem.discs))))
+        guess = Iterate(guess.states, guess.inputs, s, np.zeros((M, nodes)))
     path = {"states": (N + 1, model.nx), "inputs": (N, model.nu)}
-    coarse = N * len(problem.discs)
-    fine = guess.slack.shape == (M, coarse * problem.nodes_per_interval)
-    points = coarse * problem.nodes_per_interval if fine else coarse
-    _check(guess, {**path, "s": (M,), "slack": (M, points)})
+    _check(guess, {**path, "s": (M,), "slack": (M, nodes)})
     if guess.multipliers is not None:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}
-        _check(guess.multipliers, {**shapes, "obstacles": (M, points), "slack": (M, points)})
+        _check(guess.multipliers, {**shapes, "obstacles": (M, nodes), "slack": (M, nodes)})
         if guess.multipliers.states.size:
             _check(guess.multipliers, {"states": (N, len(problem.bounded_states))})
         if guess.multipliers.rates.size:

@@ -161,4 +161,6 @@ class Result:
         """Whether this plan is safe and the other is not, or its merit is better by `lead`."""
         if self.status.ok != other.status.ok:
             return self.status.ok
+        if not self.status.ok and self.status.certified != other.status.certified:
+            return self.status.certified
         return self.merit < other.merit - lead

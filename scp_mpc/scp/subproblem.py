@@ -173,7 +173,7 @@ class Subproblem:
             above[layout.yielding] = self._pins.start + states + np.arange(states)
         if yielding:
             below[nf + kept] = self._pins.start + 2 * states + slot
-        program.upper[self._pins.start + 2 * states : self._pins.stop] = np.inf if yielding else 0.0
+        data[self._places["slack"]] = self._coupling[1] * yielding
         return Rows(place, below, above)
 
     def start(

@@ -1,4 +1,4 @@
-"""The ladder: deadlines, the last plan, braking, and what is said about each."""
+"""The fallback hierarchy: deadlines, the last plan, braking, and what is said about each."""
 
 import time
 
@@ -19,8 +19,8 @@ from scp_mpc import (
     Status,
     Trajectory,
 )
-from scp_mpc.solver import active_set
-from scp_mpc.solver.stopwatch import Pace, Stopwatch
+from scp_mpc.qp.backend import ProgramSolver
+from scp_mpc.scp.deadline import Clock, Pace
 
 
 def test_each_status_has_a_sentence_and_knows_whether_it_is_safe():
@@ -126,34 +126,34 @@ def test_predictions_of_time_are_long_times_slowly_forgotten():
     pace.learn("program", 2.0)
     pace.learn("program", 1.0)
     assert 1.9 < pace.expected("program") < 2.0
-    watch = Stopwatch(1.0, pace)
-    assert not watch.affords("program")
+    clock = Clock(1.0, pace)
+    assert not clock.allows("program")
     tries = 1
-    while not watch.affords("program"):  # what was never begun must not be shut out for ever
+    while not clock.allows("program"):  # what was never begun must not be shut out for ever
         tries += 1
     assert 10 < tries < 60
-    assert Stopwatch(None, pace).affords("program")
+    assert Clock(None, pace).allows("program")
 
 
 def test_so_many_ways_as_fit_in():
     pace = Pace()
     pace.learn("way", 0.1)
     pace.learn("program", 0.2)
-    assert Stopwatch(1.0, pace).room("way", 16, then="program") in (6, 7)
-    assert Stopwatch(None, pace).room("way", 16, then="program") == 16
-    assert Stopwatch(0.15, pace).room("way", 16, then="program") == 0
+    assert Clock(1.0, pace).room("way", 16, then="program") in (6, 7)
+    assert Clock(None, pace).room("way", 16, then="program") == 16
+    assert Clock(0.15, pace).room("way", 16, then="program") == 0
 
 
 def slowed(monkeypatch, seconds):
-    """Make every dense program take so long; returns the list of those begun."""
-    run, begun = active_set.ActiveSetSolver._run, []
+    """Make every program take so long; returns the list of those begun."""
+    solve, begun = ProgramSolver.solve, []
 
     def slow(self, *given):
         begun.append(self)
         time.sleep(seconds)
-        return run(self, *given)
+        return solve(self, *given)
 
-    monkeypatch.setattr(active_set.ActiveSetSolver, "_run", slow)
+    monkeypatch.setattr(ProgramSolver, "solve", slow)
     return begun
 
 
@@ -179,14 +179,14 @@ def test_a_slow_solver_stops_the_search_and_is_counted(monkeypatch):
     assert again.status is Status.CONVERGED  # and forgotten in time
 
 
-def test_a_computation_that_breaks_down_ends_on_the_ladder(monkeypatch, caplog):
+def test_a_computation_that_breaks_down_ends_in_a_fallback(monkeypatch, caplog):
     mpc, step = MPC(problem(N)), closing(2.0)
     first = mpc.step(*step)
 
     def broken(*_):
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr(active_set.ActiveSetSolver, "_run", broken)
+    monkeypatch.setattr(ProgramSolver, "solve", broken)
     plan = mpc.step(*step)
     assert plan.status in (Status.PREVIOUS, Status.BRAKING)
     assert "broke down" in caplog.text

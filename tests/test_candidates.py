@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from instances import S_REF, obstacle, problem, rotated, straight_reference
+from solving import half_spaces
 
 from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction
-from scp_mpc.solver.sides import MAX_CANDIDATES, Passing, candidates, same_way
-from scp_mpc.solver.step_data import StepData
+from scp_mpc.scp.candidates import MAX_CANDIDATES, Passing, candidates, same_way
+from scp_mpc.scp.step import Step
 
 N = 20
 S = np.array([S_REF])
@@ -14,7 +15,7 @@ S = np.array([S_REF])
 
 def ways(case, reference, obstacles, present=None):
     """Ways past, about a plan that follows the reference."""
-    step = StepData.read(case, reference[0], reference, obstacles)
+    step = Step.read(case, reference[0], reference, obstacles)
     free = reference[1:, case.model.position]
     s = np.full(case.max_obstacles, S_REF)
     return step, candidates(step, free, free if present is None else present, s)
@@ -34,9 +35,7 @@ def test_the_free_plans_own_time_passes_left_and_right():
         np.testing.assert_array_equal(shift.any(axis=1), inside)
         np.testing.assert_allclose(shift[:, 0], 0.0, atol=1e-9)
         assert (shift[inside] @ side.normal > 0).all()
-        states = ref.copy()
-        states[1:, [0, 2]] = side.path
-        value = step.half_spaces(states, S).value[0]
+        value = half_spaces(step, side.path, S).value[0]
         np.testing.assert_allclose(value[inside], 0.0, atol=1e-9)
     np.testing.assert_allclose(left.normal, -right.normal)
 
@@ -133,30 +132,30 @@ def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
     case, ref = problem(N, "exact"), straight_reference(N)
     x0 = ref[0] + [0.0, 0.0, 0.4, 0.0]
     centre = ObstaclePrediction(ref[:, [0, 2]] + [0.1, 0.0], 0.04 * np.eye(2), 0.2)
-    step = StepData.read(case, x0, ref, [centre])
-    np.testing.assert_allclose(step.start, [[-0.1, 0.4]])
-    on_top = ref.copy()
-    on_top[1:, [0, 2]] = centre.means[1:]
-    normal = step.half_spaces(on_top, np.array([S_REF])).normal[0, 0]
-    assert normal @ step.start[0] > 0
+    step = Step.read(case, x0, ref, [centre])
+    start = step.here - step.means[0, 0]
+    np.testing.assert_allclose(start, [-0.1, 0.4])
+    normal = half_spaces(step, centre.means[1:], np.array([S_REF])).normal[0, 0]
+    assert normal @ start > 0
 
 
 def test_rivals_begin_at_the_state_not_at_the_reference(monkeypatch):
     case, ref = problem(20), straight_reference(20)
     solver, x0, starts = SCP(case), ref[0] + [-0.3, 0.2, 0.2, 0.0], []
-    engine = solver._resolution.coarse
-    glimpses = engine.glimpses
+    search = solver._multi_start
+    rank = search._rank
 
-    def noting(*given, **named):
-        found = glimpses(*given, **named)
-        starts.extend(start.iterate for start in found if np.isfinite(start.merit))
+    def noting(*given):
+        found = rank(*given)
+        starts.extend(search._start(one).rollout for one in found if np.isfinite(one.merit))
         return found
 
-    monkeypatch.setattr(engine, "glimpses", noting)
+    monkeypatch.setattr(search, "_rank", noting)
     solver.solve(x0, ref, [obstacle(20, (3.0, 0.1), (0.5, 0.0))])
     assert starts
     for start in starts:
-        np.testing.assert_array_equal(start.states[0], x0)
+        x = x0
         for i, u in enumerate(start.inputs):
-            expected = case.model.step(start.states[i], u)
-            np.testing.assert_allclose(start.states[i + 1], expected, atol=1e-9)
+            x = case.model.step(x, u)
+            np.testing.assert_allclose(start.deviations[i], x - ref[i + 1], atol=1e-9)
+            np.testing.assert_allclose(start.positions[i], (x - x0)[[0, 2]], atol=1e-9)
