@@ -26,9 +26,7 @@ def solution(program, solver="clarabel"):
     given += (A, b) if len(b) else (None, None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        end = qpsolvers.solve_problem(
-            qpsolvers.Problem(*given), solver, **TIGHT.get(solver, {})
-        )
+        end = qpsolvers.solve_problem(qpsolvers.Problem(*given), solver, **TIGHT.get(solver, {}))
     if not end.found:
         return None
     y, inner = np.zeros(len(program.lower)), np.zeros((~equal).sum())

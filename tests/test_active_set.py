@@ -47,9 +47,7 @@ def oracle(p):
     bounds, spaces = E[: len(p.F)], E[len(p.F) :]
     P = np.zeros((n + k, n + k))
     P[:n, :n] = np.eye(n)
-    G = np.block(
-        [[p.F, -bounds], [-p.F, -bounds], [-p.A, -spaces], [np.zeros((k, n)), -np.eye(k)]]
-    )
+    G = np.block([[p.F, -bounds], [-p.F, -bounds], [-p.A, -spaces], [np.zeros((k, n)), -np.eye(k)]])
     h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(k)])
     q = np.concatenate([np.zeros(n), cap[soft]])
     some = np.abs(h) < 1e20
@@ -320,7 +318,11 @@ def test_only_what_has_no_solution_is_proved_to_have_none(seed, shift, extra):
     p = replace(p, b=p.b + shift)
     proof, violation = farkas(p)
     there = violation < 1e-9
-    for force in (proof, *rng.normal(size=(20, 9 + extra)), *np.abs(rng.normal(size=(5, 9 + extra)))):
+    for force in (
+        proof,
+        *rng.normal(size=(20, 9 + extra)),
+        *np.abs(rng.normal(size=(5, 9 + extra))),
+    ):
         assert not (p.proves_infeasible(force) and there)
     if violation > 1e-6:
         assert p.proves_infeasible(proof)

@@ -10,11 +10,11 @@ from any_robot import DT, ROBOTS, complaints, scene, start, world
 
 from scp_mpc import MPC, SCP, ObstaclePrediction, Problem, Settings
 from scp_mpc.robots import KinematicBicycle, Unicycle
-from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.scp import Iterate, KKTResiduals, Multipliers, Status
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.plan import Result
+from scp_mpc.simulation.crowds import Crowd
 
 
 def drive(robot, seed, steps=2):

@@ -49,7 +49,9 @@ def test_the_sparse_program_equals_the_dense_rebuild(changes, elastic):
         couplings = couplings_of(program, this) if elastic else None
         slow = rebuilt(this, *given, inputs, elastic, last, couplings)
         found = program.P.toarray(), program.q, program.A.toarray(), program.lower, program.upper
-        for mine, theirs in zip(found, (slow.P, slow.q, slow.A, slow.lower, slow.upper), strict=True):
+        for mine, theirs in zip(
+            found, (slow.P, slow.q, slow.A, slow.lower, slow.upper), strict=True
+        ):
             np.testing.assert_allclose(mine, theirs, rtol=1e-7, atol=1e-7)
 
 
@@ -76,9 +78,7 @@ def test_excess_is_slack_where_it_is_paid_for_and_a_violation_where_not():
     for share, violation in ((1.0, 0.0), (0.5, excess.max())):
         layout, empty = at.layout, np.zeros((0, 0))
         reaction = layout.gathered(np.zeros(1), np.zeros((N, 2)), empty, share * force)
-        paid = at.certify(
-            plain.y, plain.rollout, reaction, nobody, none, np.zeros(0, dtype=bool)
-        )
+        paid = at.certify(plain.y, plain.rollout, reaction, nobody, none, np.zeros(0, dtype=bool))
         np.testing.assert_allclose(paid.excess, excess[:, 1:].ravel(), atol=1e-12)
         assert paid.residuals.feasibility == pytest.approx(violation, abs=1e-12)
         price = at.merit(paid.cost, 0.0, paid.excess) - paid.cost

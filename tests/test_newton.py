@@ -15,10 +15,10 @@ from scp_mpc import (
     Status,
     Trajectory,
 )
+from scp_mpc.qp.active_set import CondensedQP, settled
 from scp_mpc.safety import NoGoSets
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation
 from scp_mpc.safety.tangents import inverse_root, tangents
-from scp_mpc.qp.active_set import CondensedQP, settled
 from scp_mpc.scp import loop
 from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.loop import Loop

@@ -428,7 +428,10 @@ def test_what_has_no_solution_is_proved_to_have_none_and_piqp_not_asked(monkeypa
 def test_ranks_are_lower_bounds_and_cut_what_is_beyond_the_limit(seed):
     qp, p, rows = pair(seed)
     optimum = qp.merit(solution(p)[0])
-    solver, begin = ProgramSolver(p, np.arange(0), "osqp", QPSettings()), (np.zeros(10), np.zeros(16))
+    solver, begin = (
+        ProgramSolver(p, np.arange(0), "osqp", QPSettings()),
+        (np.zeros(10), np.zeros(16)),
+    )
     bound, (x, y) = solver.rank(qp, rows, begin, np.inf)
     assert 0 <= bound <= optimum * (1 + 1e-9)
     assert x.shape == (10,)
@@ -466,9 +469,9 @@ def test_a_row_yields_where_its_slack_is_not_pinned():
 def test_plans_do_not_depend_on_who_solves_the_programs(name, kind):
     case = instance(kind, 12, "exact", 0.5, 0) if name == "linear" else ride(name, kind, 12, 0)
     plans = {
-        solver: SCP(
-            case.problem, Settings(solver=solver, multi_start=False, tolerance=1e-8)
-        ).solve(case.x0, case.x_ref, case.obstacles)
+        solver: SCP(case.problem, Settings(solver=solver, multi_start=False, tolerance=1e-8)).solve(
+            case.x0, case.x_ref, case.obstacles
+        )
         for solver in ("osqp", "piqp", "clarabel")
     }
     first = plans["osqp"]

@@ -322,7 +322,7 @@ def test_a_leap_that_costs_more_is_taken_back(aside, monkeypatch):
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
     given = case.x0, case.x_ref, case.obstacles, guess
     with monkeypatch.context() as plain:
-        plain.setattr(loop, "refined", lambda at, convex, leaps: (convex.solution, None))
+        plain.setattr(loop, "refined", lambda _, convex, __: (convex.solution, None))
         expected = SCP(case.problem, settings).solve(*given)
     rejected, accepts = [], Region.accepts
 

@@ -282,7 +282,8 @@ def test_inputs_are_moved_into_their_rates():
 def test_the_objective_is_the_problems_cost(case):
     this, x0, x_ref, things = CASES[case]()
     plan = about(this, x0, 3)
-    program, size, nu = SCP(this).subproblem(x0, x_ref, things, guess=plan), this.size, this.model.nu
+    program = SCP(this).subproblem(x0, x_ref, things, guess=plan)
+    size, nu = this.size, this.model.nu
     s = np.random.default_rng(0).uniform(0.5, 3.0, 2)
     moving = size.lower < size.reference
     s = s if moving else np.full(2, size.reference)

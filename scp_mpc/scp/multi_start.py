@@ -110,7 +110,7 @@ class MultiStart:
         here = Passing(at.path(nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
         ways = candidates(step, free, here.path, full, most)
-        ranked = self._rank(nominal, best, free, [way.path for way in ways])
+        ranked = self._rank(nominal, best, free, [way.path for way in ways], thorough)
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
             Candidate(way.obstacle, way.normal, way.time, one.merit)
@@ -139,7 +139,12 @@ class MultiStart:
         return Found(goal, tried, switched)
 
     def _rank(
-        self, nominal: Nominal, best: Result, free: FloatArray, paths: list[FloatArray]
+        self,
+        nominal: Nominal,
+        best: Result,
+        free: FloatArray,
+        paths: list[FloatArray],
+        thorough: bool,
     ) -> list[Ranked]:
         """Solve one program about each path (C, d), all linearised at once, until the deadline."""
         at, c = self._at, self._at.layout
@@ -169,12 +174,16 @@ class MultiStart:
                 found.append(Ranked(inf, Passing(path, nobody), about, *nothing))
                 continue
             inputs, sizes = subproblem.plan(z, nominal.y[c.s])
-            force = rows.forces(y)
-            there = at.path(condensed.y(qp.unbox @ at.boxed(condensed, inputs, sizes)))[1:]
+            v, force = qp.unbox @ at.boxed(condensed, inputs, sizes), rows.forces(y)
+            exact = subproblem.solver.solve(qp, rows, (z, y)) if thorough else None
+            if exact is not None:
+                v, force, bound = exact.v, exact.force, qp.merit(exact.v)
+                inputs = at.inputs(condensed.y(v))
+            there = at.path(condensed.y(v))[1:]
             push = nominal.pairs.table(force[len(qp.F) :] > NEGLIGIBLE)
             passing = Passing(there, push)
             found.append(Ranked(bound, passing, about, inputs, sizes, force))
-            if safe and self._settings.max_candidates == 1:
+            if safe and not thorough and self._settings.max_candidates == 1:
                 limit = min(limit, bound)
         self._pairs = nominal.pairs
         return found
@@ -213,7 +222,7 @@ class MultiStart:
             if not paths or not most:
                 break
             began = clock.elapsed
-            more = self._rank(nominal, best, free, paths[:most])
+            more = self._rank(nominal, best, free, paths[:most], True)
             clock.learn("candidate", began, len(more))
             beam = _best([*beam, *more])
         return beam or ranked
