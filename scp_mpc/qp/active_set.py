@@ -227,8 +227,9 @@ def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) 
         capped: (nf + K,) guess of those that yield.
         changes: Systems to solve at most, beyond the first.
     """
-    none = np.append(qp.lower <= -_NONE, np.zeros(len(qp.b), dtype=np.bool_)), np.append(
-        qp.upper >= _NONE, np.ones(len(qp.b), dtype=np.bool_)
+    none = (
+        np.append(qp.lower <= -_NONE, np.zeros(len(qp.b), dtype=np.bool_)),
+        np.append(qp.upper >= _NONE, np.ones(len(qp.b), dtype=np.bool_)),
     )
     active = np.where(((active < 0) & none[0]) | ((active > 0) & none[1]), 0, active)
     solution, systems = solve_on(qp, active, capped & (active != 0)), 1
@@ -324,7 +325,7 @@ def _gap(qp: CondensedQP, v: FloatArray, p: int, side: int, yields: bool) -> flo
 
 
 def _violations(qp: CondensedQP, v: FloatArray) -> tuple[FloatArray, IntArray]:
-    """By how much each constraint (nf + K,) is violated, negative if it holds; and at which side."""
+    """By how much constraints (nf + K,) are violated, negative if they hold; and at which side."""
     nf, values = len(qp.F), qp.rows @ v
     bounded = values[:nf]
     below, above = qp.lower - bounded, bounded - qp.upper

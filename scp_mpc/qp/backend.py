@@ -1,10 +1,13 @@
-"""Who solves a program, and how far that is believed: the solver asked, the exact solve, the rescue.
+"""Who solves a program, and how far that is believed.
 
-repeat:  run the solver a little further        (OSQP: 10, 15, 25, .. iterations)
-the signs of its multipliers            -> a guess of the active set
-solve exactly on it, check all rows     -> solution, or a better guess (active_set.py)
-until    a guess holds, or the multipliers prove that there is no solution, or the budget is up
-rescue:  PIQP, judged in the same way
+    repeat:  run the solver a little further         (OSQP: 10 iterations, then 25)
+             the signs of its multipliers            -> a guess of the active set
+             from there to the exact solution        -> solution, or not within so many changes
+    until    there is one, or multipliers prove that there is none, or the runs are used up
+    rescue:  PIQP, judged in the same way
+
+What a solver returns is never taken as it is: `active_set.py` solves with the program's own data and
+checks every constraint and every force.
 """
 
 from collections import Counter
@@ -73,6 +76,7 @@ class ProgramSolver:
 
     Attributes:
         backend: The solver.
+        iterations: ADMM iterations that OSQP spent on the last program; 0 of other solvers.
         finished: Programs by who finished them: the solver, "repaired" where its active set took
             more than one repair, "piqp". And programs that nobody finished: "ranked" by a bound,
             "cut" because that is too high, "infeasible".
@@ -87,6 +91,7 @@ class ProgramSolver:
         if settings.rescue and name != "piqp":
             self._rescue = PIQP(program, equations)
         self.finished: Counter[str] = Counter()
+        self.iterations = 0
 
     def solve(
         self,
@@ -106,6 +111,7 @@ class ProgramSolver:
         self.backend.load(start)
         for effort, repairs in self.backend.stages:
             point = _run(self.backend, effort)
+            self.iterations = getattr(self.backend, "iterations", 0)
             if point is None:
                 break
             end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)

@@ -7,7 +7,6 @@ from scp_mpc.safety.margin import JointRisk
 from scp_mpc.safety.risk import size_at_risk
 from scp_mpc.scp.loop import Loop
 from scp_mpc.scp.plan import Result
-from scp_mpc.scp.risk import point_risks
 from scp_mpc.scp.transcription import Transcription
 
 _ROUNDS = 6  # at most
@@ -28,13 +27,13 @@ def allocate(at: Transcription, loop: Loop, best: Result) -> Result:
         if not (best.status.ok and best.iterate.touches and at.clock.allows("iteration")):
             break
         path = step.nodes.positions(best.iterate.states, best.iterate.inputs)
-        risks = reallocated(risks, point_risks(step, path))
-        at.widen(step.scaled(size_at_risk(risks)))
+        risks = reallocated(risks, step.risks(path))
+        at.step = step.scaled(size_at_risk(risks))
         other = loop.run(at.at(best.iterate))
         if other is None or not other.beats(best, 0.0):
             break
         gain, best = best.merit - other.merit, other
         if gain <= _GAIN * best.merit:
             break
-    at.widen(step)
+    at.step = step
     return best

@@ -10,11 +10,13 @@ about the path gives half-spaces on that side, sound as any. Polytopes often sta
 walls do: there are candidates that pass all of them on one side, the first few on either, or none.
 
 Notation:
-    C                   points of the plan, K in each stage; K is not 1 between fast samples only
+    C                   collision nodes of the plan
     p       (C, d)      positions of the plan that ignores the obstacles
     v       (d,)        motion relative to the obstacle in one stage, over the conflict [m]
     n       (d,)        side: a unit vector square to v
     tau                 stages by which the candidate passes later (negative) or earlier
+    e       (k, d)      semi-axes s sigma + r of ellipsoids; w and m: offset and n in units of them
+    rho     (k,)        s sigma + r, by which polytopes are rounded, or their faces put forward [m]
 """
 
 from collections.abc import Iterator
@@ -24,7 +26,7 @@ from itertools import chain, islice, product
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
-from scp_mpc.scp.detours import WAYS, Ellipsoids, Walls
+from scp_mpc.safety.polytopes import Polytopes
 from scp_mpc.scp.step import Step
 
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
@@ -33,6 +35,11 @@ _AROUND = 3  # stages before and after a conflict that a candidate may change
 _STILL = 1e-6  # relative motion in one stage, over the distance, that counts as none
 _MIXED = 3  # polytopes whose sides are tried in all combinations
 _COSINE = 0.9  # of the angle between two directions that count as one side
+_TOUCH = 1e-9  # [m] less than that within is not within
+_PARALLEL = 1e-9  # cosine below which a face is never reached
+# tau, and whether to leave the no-go set away from its middle: as the free plan would, one stage
+# later or earlier, two later
+_WAYS = ((0.0, False), (-1.0, False), (1.0, False), (-2.0, True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +88,7 @@ def candidates(
         s: (M,) sizes of the ellipsoids.
         most: How many ways to return at most.
     """
-    conflict = step.conflicts(free, s)
+    conflict = step.depths(free, s) > 0
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
     count = np.count_nonzero(first < conflict.shape[1])
     order = np.argsort(first, kind="stable")[:count].tolist()
@@ -187,10 +194,10 @@ def _ways(
             path = elsewhere.copy()
             path[reach] = body.aside(free[reach], n)
             yield Side(j, n, 0.0, path)
-    for time, push in WAYS:
+    for time, outward in _WAYS:
         for n in normals:
-            path = elsewhere.copy()
-            path[reach] = push(body, free[reach] + time * v, n)
+            path, moved = elsewhere.copy(), free[reach] + time * v
+            path[reach] = body.outward(moved, n) if outward else body.aside(moved, n)
             yield Side(j, n, time, path)
 
 
@@ -211,3 +218,120 @@ def _directions(
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
     square = np.linalg.svd(v[None])[2][1:]
     return v, [sign * n for n in square for sign in (1.0, -1.0)]
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoids:
+    """Ellipsoids, their axes lengthened by the radii."""
+
+    means: FloatArray
+    scaling: FloatArray  # (k, d, d) takes offsets to units of the semi-axes
+
+    @classmethod
+    def of(cls, step: Step, s: float, j: int, reach: slice) -> "Ellipsoids":
+        """Those of obstacle j at some points, at size s."""
+        variances, rotations = np.linalg.eigh(step.covariances[j, 1:][reach])
+        radii = step.radii[j, reach, None]
+        e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + radii, 1e-9)
+        return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
+
+    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move the points of a path (k, d) that lie within along n to the boundary."""
+        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
+        m = self.scaling @ n
+        mm, wm = (m * m).sum(axis=1), (w * m).sum(axis=1)
+        room = 1 - (w * w).sum(axis=1)  # positive inside
+        shift = np.where(room > 0, (np.sqrt(wm**2 + mm * np.maximum(room, 0.0)) - wm) / mm, 0.0)
+        return path + shift[:, None] * n
+
+    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move them away from the middle, and half as much towards n, to the boundary."""
+        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
+        m = self.scaling @ n
+        within = (w * w).sum(axis=1) < 1
+        w[within] += 0.5 * m[within] / np.linalg.norm(m[within], axis=1, keepdims=True)
+        w[within] /= np.maximum(np.linalg.norm(w[within], axis=1, keepdims=True), 1e-12)
+        boundary: FloatArray = self.means + np.linalg.solve(self.scaling, w[..., None])[..., 0]
+        return boundary
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """One or several polytopes (w of them), left together; their faces are put forward by rho."""
+
+    shapes: Polytopes
+    means: FloatArray  # (w, k, d)
+    rho: FloatArray  # (w, k)
+
+    @classmethod
+    def of(cls, step: Step, s: FloatArray, slots: IntArray, reach: slice) -> "Walls":
+        """Those of some obstacles at some points, at sizes s (M,)."""
+        assert step.shapes is not None
+        variances = np.linalg.eigvalsh(step.covariances[slots, 1:][:, reach])[..., -1]
+        rho = step.radii[slots, reach] + s[slots, None] * np.sqrt(np.maximum(variances, 0.0))
+        return cls(step.shapes.taken(slots), step.means[slots, 1:][:, reach], rho)
+
+    def faces(self, known: list[FloatArray]) -> list[FloatArray]:
+        """Normals of faces that are not nearly those known, nor each other: at most two an axis."""
+        found: list[FloatArray] = []
+        for n in self.shapes.normals[self.shapes.kind[0]]:
+            if len(found) < 2 * len(n) and all(n @ other < _COSINE for other in known + found):
+                found.append(n)
+        return found
+
+    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move the points of a path (k, d) that lie within along n to the boundary."""
+        return self._out(path, n)
+
+    def apart(self, path: FloatArray, normals: FloatArray) -> FloatArray:
+        """The same, but out of each polytope towards a side of its own (w, d)."""
+        return self._out(path, normals[:, None])
+
+    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
+        """Move them away from the first one, and half as much towards n, to the boundary."""
+        first = self.shapes.taken(np.zeros(1, dtype=np.intp))
+        away = first.nearest((path - self.means[0])[None]).normal[0] + 0.5 * n
+        return self._out(path, away / np.linalg.norm(away, axis=1, keepdims=True))
+
+    def _out(self, path: FloatArray, along: FloatArray) -> FloatArray:
+        """Move what is within along unit vectors (w, k, d): out of one, and of what comes next."""
+        along = np.broadcast_to(along, self.means.shape)
+        speed = along @ np.swapaxes(self.shapes.normals[self.shapes.kind], 1, 2)
+        ahead, points = speed > _PARALLEL, np.arange(len(path))
+        for _ in self.means:
+            y = path - self.means
+            within = self.shapes.distance(y) < self.rho - _TOUCH
+            if not within.any():
+                break
+            room = self.rho[..., None] - self.shapes.depths(y)
+            way = np.where(ahead, room / np.where(ahead, speed, 1.0), np.inf).min(axis=2)
+            way = np.where(within, way, 0.0)
+            which = way.argmax(axis=0)
+            path = path + way[which, points][:, None] * along[which, points]
+        return path
+
+    def flips(self, path: FloatArray, touched: BoolArray, count: int) -> list[FloatArray]:
+        """Paths that pass one polytope at one stage by another face than a path (k, d) does.
+
+        What does not push the path need not be moved: to give it more room would gain nothing.
+
+        Args:
+            path: Positions.
+            touched: (w, k) which polytopes push it, at which points.
+            count: Points in a stage.
+        """
+        y = path - self.means
+        stages = touched.reshape(len(y), -1, count).any(axis=2)
+        found = []
+        for w, i in np.argwhere(stages).tolist():
+            at = slice(i * count, (i + 1) * count)
+            one = self.shapes.taken(np.array([w]))
+            normals = one.normals[one.kind[0]]
+            here = one.nearest(y[None, w, at]).normal[0, -1]
+            for f in np.unique(normals, axis=0, return_index=True)[1].tolist():
+                if normals[f] @ here < _COSINE:
+                    new = path.copy()
+                    over = one.over(f, y[w, at]) + self.rho[w, at, None] * normals[f]
+                    new[at] = self.means[w, at] + over
+                    found.append(new)
+        return found

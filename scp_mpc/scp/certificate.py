@@ -18,7 +18,7 @@ Notation:
     W           (nv, nv)    the Lagrangian's second derivative is I + W in condensed coordinates
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import qr
@@ -132,8 +132,9 @@ class Certificate:
         rollout: Rollout,
         reaction: FloatArray,
         pairs: Pairs,
+        planes: Planes,
         force: FloatArray,
-        capped: FloatArray,
+        slack: FloatArray,
         bounds: tuple[FloatArray, FloatArray],
     ) -> Nominal:
         """Return the plan with its residuals.
@@ -143,13 +144,13 @@ class Certificate:
             rollout: The plan that belongs to its inputs.
             reaction: (nf,) forces of the bounds.
             pairs: Of obstacle and node.
+            planes: Their constraints, linearised there.
             force: (K,) forces of the obstacles.
-            capped: (K,) which of the pairs yield.
+            slack: (K,) violation of those that yield [m].
             bounds: Of y in this step.
         """
         problem, c = self._problem, self._layout
         u, e, w = rollout.inputs, rollout.deviations, problem.size.weight
-        planes = pairs.planes(y)
         away = y[c.s] - problem.size.reference
         push = u if self._idle is None else u - self._idle
         track, effort = self.track(e), push @ problem.R
@@ -164,7 +165,6 @@ class Certificate:
             pull = 2 * w * away if on_s is None else 2 * w * away - on_s
             stationarity = max(stationarity, float(np.abs(pull).max()))
         feasibility = product = 0.0
-        slack = np.where(capped, np.maximum(-planes.g, 0.0), 0.0)
         if len(force):
             gap = planes.g + slack
             feasibility = max(0.0, -float(gap.min()))
@@ -245,8 +245,3 @@ def _smallest(
         M += np.abs(M).max() * (basis @ basis.T)  # directions that are gone bend up
     values, vectors = np.linalg.eigh(M)
     return float(values[0]) / max(float(np.abs(values).max()), _LEAST), vectors[:, 0]
-
-
-def with_curvature(nominal: Nominal, least: float) -> Nominal:
-    """The same plan with its second-order condition known."""
-    return replace(nominal, residuals=replace(nominal.residuals, curvature=least))

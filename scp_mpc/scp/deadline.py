@@ -1,6 +1,6 @@
 """Where the time of one control step goes, and whether what comes next still fits in."""
 
-from collections import Counter
+from collections import defaultdict
 from math import inf
 from time import perf_counter
 
@@ -18,20 +18,20 @@ class Pace:
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
-        self._seconds: dict[str, float] = {}
+        self._seconds: defaultdict[str, float] = defaultdict(float)
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
-        return self._seconds.get(task, 0.0)
+        return self._seconds[task]
 
     def learn(self, task: str, seconds: float) -> None:
         """Take note of a measured time."""
-        known = self.expected(task)
+        known = self._seconds[task]
         self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
 
     def ease(self, task: str) -> None:
         """Expect a little less, after a task was not begun."""
-        self._seconds[task] = _EASE * self.expected(task)
+        self._seconds[task] *= _EASE
 
 
 class Clock:
@@ -49,43 +49,27 @@ class Clock:
         """Begin the step."""
         self._deadline = inf if deadline is None else deadline
         self._pace = Pace() if pace is None else pace
-        self.spent: Counter[str] = Counter()
+        self.spent: defaultdict[str, float] = defaultdict(float)
         self._began = self._lap = perf_counter()
 
-    @property
     def elapsed(self) -> float:
         """Seconds since the step began."""
         return perf_counter() - self._began
 
-    @property
-    def remaining(self) -> float:
-        """Seconds until the deadline, negative after it; infinite without one."""
-        return self._deadline - self.elapsed
-
-    @property
-    def unlimited(self) -> bool:
-        """Whether there is no deadline."""
-        return self._deadline == inf
-
-    def begin(self) -> None:
-        """Begin a lap."""
-        self._lap = perf_counter()
-
     def charge(self, what: str) -> None:
-        """End a lap, book it on something, and begin the next one."""
+        """Book the time since it was last booked."""
         now = perf_counter()
-        self.spent[what] += now - self._lap  # type: ignore[assignment]
+        self.spent[what] += now - self._lap
         self._lap = now
 
-    def allows(self, *tasks: str) -> bool:
-        """Whether some tasks, and what ends the step, are predicted to end before the deadline."""
+    def allows(self, task: str) -> bool:
+        """Whether a task, and what ends the step, are predicted to end before the deadline."""
         if self._deadline == inf:
             return True
-        ending = self._pace.expected("ending")
-        if sum(map(self._pace.expected, tasks)) + ending <= self.remaining:
+        needed = self._pace.expected(task) + self._pace.expected("ending")
+        if needed <= self._deadline - self.elapsed():
             return True
-        for task in tasks:
-            self._pace.ease(task)
+        self._pace.ease(task)
         return False
 
     def room(self, task: str, most: int, then: str) -> int:
@@ -93,7 +77,7 @@ class Clock:
         if self._deadline == inf:
             return most
         after = self._pace.expected(then) + self._pace.expected("ending")
-        spare = self.remaining - after
+        spare = self._deadline - self.elapsed() - after
         times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
         if times < most:
             self._pace.ease(task)
@@ -102,4 +86,4 @@ class Clock:
     def learn(self, task: str, since: float, times: int = 1) -> None:
         """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""
         if self._deadline < inf and times:
-            self._pace.learn(task, (self.elapsed - since) / times)
+            self._pace.learn(task, (self.elapsed() - since) / times)

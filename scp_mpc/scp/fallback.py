@@ -1,4 +1,4 @@
-"""The last rungs of the ladder: what to do when the search has no plan that meets every constraint.
+"""The fallback hierarchy: what to do when the search has no plan that meets every constraint.
 
 1. the certified plan       2. a feasible iterate
 3. the last plan, shifted: its inputs from the state now, rechecked against the new predictions
@@ -11,7 +11,6 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import KKTResiduals
-from scp_mpc.robots.linear import LinearModel
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Result, Status
 from scp_mpc.scp.step import Step
@@ -28,21 +27,8 @@ class Fallback:
     """
 
     def __init__(self, problem: Problem, tolerance: float) -> None:
-        """Find the response of a linear robot's states to the state now and to all inputs."""
+        """Remember both."""
         self._problem, self._tolerance = problem, tolerance
-        self._response: FloatArray | None = None
-        if isinstance(problem.model, LinearModel):
-            self._respond(problem.model, problem.horizon)
-
-    def _respond(self, model: LinearModel, N: int) -> None:
-        powers = [np.eye(model.nx)]
-        response = np.zeros((N, model.nx, N, model.nu))
-        with np.errstate(over="ignore", invalid="ignore"):  # then nothing rolled out is judged safe
-            for k in range(N):
-                response[np.arange(k, N), :, np.arange(N - k)] = powers[-1] @ model.B
-                powers.append(model.A @ powers[-1])
-        self._drift = np.concatenate(powers[1:])
-        self._response = response.reshape(N * model.nx, N * model.nu)
 
     def best(self, step: Step, last: Iterate | None) -> Result:
         """The last plan, if it meets every constraint; else braking, whether it does or not."""
@@ -91,7 +77,10 @@ class Fallback:
     def _judged(self, step: Step, inputs: FloatArray, status: Status) -> Result:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
         problem = self._problem
-        states = self._rolled_out(step.x0, inputs)
+        states = np.empty((len(inputs) + 1, problem.model.nx))
+        states[0] = step.x0
+        for i, u in enumerate(inputs):
+            states[i + 1] = problem.model.step(states[i], u)
         lost = ~np.isfinite(states).all(axis=1)
         if lost.any():  # where the model has no next state, it stays in the last one
             states[lost] = states[int(lost.argmax()) - 1]
@@ -107,14 +96,3 @@ class Fallback:
         merit = cost + problem.penalty(slack, states)
         residuals = KKTResiduals(np.inf, most, np.inf)
         return Result(Iterate(states, inputs, s, slack).frozen(), cost, merit, residuals, status, 0)
-
-    def _rolled_out(self, x0: FloatArray, inputs: FloatArray) -> FloatArray:
-        """States (N+1, nx) to which inputs lead."""
-        model = self._problem.model
-        if self._response is None:
-            states = [x0]
-            for u in inputs:
-                states.append(model.step(states[-1], u))
-            return np.array(states)
-        after = self._drift @ x0 + self._response @ inputs.ravel()
-        return np.concatenate([x0[None], after.reshape(-1, model.nx)])

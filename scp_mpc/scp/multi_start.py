@@ -5,7 +5,7 @@ prove that it cannot win; the best are followed to their end, and win if they ar
 Where the plan needs slack, all are followed until one does not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -24,7 +24,7 @@ from scp_mpc.scp.iterate import NEGLIGIBLE
 from scp_mpc.scp.loop import Loop
 from scp_mpc.scp.pairs import Pairs
 from scp_mpc.scp.plan import Candidate, Result
-from scp_mpc.scp.transcription import Transcription
+from scp_mpc.scp.transcription import Program, Relaxation, Transcription
 
 # A rival must be better by this share, or the plan flickers between ways of equal cost.
 _HYSTERESIS = 0.001
@@ -43,15 +43,13 @@ class Ranked:
             solution, or none that can win.
         passing: Its positions, and who pushes it where.
         about: (ny,) the path, where its half-spaces are taken.
-        inputs: (N, nu) that it seems to lead to, with sizes (M,) and forces (nf + K,).
+        start: The plan that it seems to lead to, with its multipliers; None if it cannot win.
     """
 
     merit: float
     passing: Passing
     about: FloatArray
-    inputs: FloatArray
-    sizes: FloatArray
-    force: FloatArray
+    start: Nominal | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +97,18 @@ class MultiStart:
         """
         at, step, clock = self._at, self._at.step, self._at.clock
         assert best.nominal is not None
-        safe, nominal = best.status.ok, best.nominal
+        safe = best.status.ok
         thorough = step.shapes is not None and (fresh or not safe)
         most = clock.room(
             "candidate", MOST_AMONG_WALLS if thorough else MAX_CANDIDATES, then="iteration"
         )
         if not most:
             return Found(best)
-        began = clock.elapsed
-        here = Passing(at.path(nominal.y)[1:], best.iterate.touched[: step.count])
+        began = clock.elapsed()
+        here = Passing(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
         ways = candidates(step, free, here.path, full, most)
-        ranked = self._rank(nominal, best, free, [way.path for way in ways], thorough)
+        ranked = self._rank(best, free, [way.path for way in ways], thorough)
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
             Candidate(way.obstacle, way.normal, way.time, one.merit)
@@ -118,87 +116,94 @@ class MultiStart:
         )
         follow = self._settings.max_candidates
         if thorough:
-            ranked = self._searched(nominal, best, free, ranked, full)
+            ranked = self._searched(best, free, ranked, full)
             follow += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
         # A plan with slack is beaten by any without: then all ways are worth their time.
         for one in ranked[:follow] if safe else ranked:
-            if one.merit == inf or (not safe and goal.status.ok) or not clock.allows("iteration"):
+            if one.start is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
             if safe and same_way(step, one.passing, here):
                 continue  # this way leads to where we are
-            rival = self._loop.run(self._start(one), goal, one.about, firm=True)
+            rival = self._loop.run(one.start, goal, one.about, firm=True)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         # None is without slack; then the one that seems to need the least is worth a try.
-        if not goal.status.ok and ranked and ranked[0].merit < goal.merit:
-            rival = self._loop.run(self._start(ranked[0]), goal, ranked[0].about)
+        first = ranked[0] if ranked and not goal.status.ok else None
+        if first is not None and first.start is not None and first.merit < goal.merit:
+            rival = self._loop.run(first.start, goal, first.about)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         return Found(goal, tried, switched)
 
     def _rank(
-        self,
-        nominal: Nominal,
-        best: Result,
-        free: FloatArray,
-        paths: list[FloatArray],
-        thorough: bool,
+        self, best: Result, free: FloatArray, paths: list[FloatArray], thorough: bool
     ) -> list[Ranked]:
-        """Solve one program about each path (C, d), all linearised at once, until the deadline."""
-        at, c = self._at, self._at.layout
-        if not paths:
+        """Look at one program about each path (C, d), all linearised at once, until the deadline.
+
+        A thorough look solves it; else the multipliers after a few iterations have to do, which
+        bound its optimum from below.
+        """
+        at, c, plan = self._at, self._at.layout, best.nominal
+        if not paths or plan is None:
             return []
-        safe = best.status.ok
-        full = np.full(at.problem.max_obstacles, at.problem.size.reference)
-        ys = np.repeat(nominal.y[None], len(paths), axis=0)
-        ys[:, c.s] = full
+        ys = np.repeat(plan.y[None], len(paths), axis=0)
+        ys[:, c.s] = at.problem.size.reference
         ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
-        known = np.zeros((at.step.count, at.nodes.size), dtype=np.bool_)
-        alone = nominal.y.copy()
+        alone = plan.y.copy()
         alone[c.p] = (free - at.step.here).ravel()
-        near = at.near(alone, at.near(nominal.y, known))
-        nominal = at.with_pairs(nominal, Pairs(at.step, c, near))
-        condensed, give = at.condensed(nominal), at.relaxations(safe)[-1]
-        nobody, nothing = np.zeros(near.shape, dtype=np.bool_), (np.zeros(0),) * 3
-        limit, found = _HOPELESS * best.merit if safe else inf, list[Ranked]()
-        for path, about, planes in zip(paths, ys, nominal.pairs.about(ys), strict=True):
-            if at.clock.remaining < 0:
+        pairs = Pairs(at.step, c, at.near(alone, at.near(plan.y, plan.pairs.near & False)))
+        force = plan.pairs.table(plan.force)[pairs.obstacle, pairs.node]
+        present = replace(plan, pairs=pairs, force=force)  # where the programs' solver starts
+        condensed = at.linearise(present)
+        give = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
+        limit, found = _HOPELESS * best.merit if best.status.ok else inf, list[Ranked]()
+        for path, about, planes in zip(paths, ys, pairs.about(ys), strict=True):
+            if not at.clock.allows("candidate"):
                 break
-            qp = at.convex_qp(condensed, nominal.pairs, planes, give)
-            subproblem, rows = at.write(condensed, nominal.pairs, planes, give)
-            start = at.start(subproblem, nominal)
-            bound, (z, y) = subproblem.solver.rank(qp, rows, start, limit)
-            if bound == inf:
-                found.append(Ranked(inf, Passing(path, nobody), about, *nothing))
-                continue
-            inputs, sizes = subproblem.plan(z, nominal.y[c.s])
-            v, force = qp.unbox @ at.boxed(condensed, inputs, sizes), rows.forces(y)
-            exact = subproblem.solver.solve(qp, rows, (z, y)) if thorough else None
-            if exact is not None:
-                v, force, bound = exact.v, exact.force, qp.merit(exact.v)
-                inputs = at.inputs(condensed.y(v))
-            there = at.path(condensed.y(v))[1:]
-            push = nominal.pairs.table(force[len(qp.F) :] > NEGLIGIBLE)
-            passing = Passing(there, push)
-            found.append(Ranked(bound, passing, about, inputs, sizes, force))
-            if safe and not thorough and self._settings.max_candidates == 1:
-                limit = min(limit, bound)
-        self._pairs = nominal.pairs
+            program = at.write(present, condensed, planes, give)
+            one = self._look(program, present, path, about, limit, thorough)
+            found.append(one)
+            if best.status.ok and not thorough and self._settings.max_candidates == 1:
+                limit = min(limit, one.merit)
         return found
 
-    def _start(self, one: Ranked) -> Nominal:
-        """The plan of a way's inputs, with its multipliers."""
-        at, pairs = self._at, self._pairs
-        y, rollout = at.rolled(one.inputs, one.sizes)
-        nf = len(one.force) - len(pairs.node)
-        none = np.zeros(len(pairs.node), dtype=np.bool_)
-        return at.certify(y, rollout, one.force[:nf], pairs, one.force[nf:], none)
+    def _look(
+        self,
+        program: Program,
+        present: Nominal,
+        path: FloatArray,
+        about: FloatArray,
+        limit: float,
+        thorough: bool,
+    ) -> Ranked:
+        at, qp, rows = self._at, program.qp, program.rows
+        subproblem, condensed = program.subproblem, program.condensed
+        start = at.start(program, present)
+        merit, (z, y) = subproblem.solver.rank(qp, rows, start, limit)
+        exact = None
+        if thorough and merit < inf:
+            exact = subproblem.solver.solve(qp, rows, (z, y))
+            merit = inf if exact is None else qp.merit(exact.v)
+        at.clock.charge("solve")
+        if merit == inf:
+            nobody = np.zeros(program.pairs.near.shape, dtype=np.bool_)
+            return Ranked(inf, Passing(path, nobody), about, None)
+        if exact is not None:
+            v, force = exact.v, exact.force
+        else:
+            free = condensed.y_free[at.layout.boxed][: len(qp.unbox)]
+            v, force = qp.unbox @ (subproblem.box(z) - free), rows.forces(y)
+        reached = condensed.y(v)
+        nf = len(qp.F)
+        push = program.pairs.table(force[nf:] > NEGLIGIBLE)
+        y, rollout = at.rolled(reached[at.layout.u].reshape(at.layout.shape), reached[at.layout.s])
+        start = at.nominal(y, rollout, force[:nf], program.pairs, force[nf:])
+        return Ranked(merit, Passing(at.path(reached)[1:], push), about, start)
 
     def _searched(
         self,
-        nominal: Nominal,
         best: Result,
         free: FloatArray,
         ranked: list[Ranked],
@@ -221,8 +226,8 @@ class MultiStart:
             most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
             if not paths or not most:
                 break
-            began = clock.elapsed
-            more = self._rank(nominal, best, free, paths[:most], True)
+            began = clock.elapsed()
+            more = self._rank(best, free, paths[:most], True)
             clock.learn("candidate", began, len(more))
             beam = _best([*beam, *more])
         return beam or ranked

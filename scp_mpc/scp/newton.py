@@ -32,64 +32,59 @@ from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
 from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.active_set import QPSolution, holds
 from scp_mpc.scp.certificate import Nominal
-from scp_mpc.scp.transcription import Convex, Transcription
+from scp_mpc.scp.transcription import Program, Transcription
 
-_ROUNDING = 1e-9  # violation of a linearised constraint that is none
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
 _LESS = 1e-9  # relative fall of the merit that is none
 _STRIDE = 4.0  # steps to look ahead where they lead away; its powers if they still do
 
 
-def refined(at: Transcription, convex: Convex, leaps: int) -> tuple[QPSolution, FloatArray | None]:
+def refined(
+    at: Transcription, program: Program, solution: QPSolution, leaps: int
+) -> tuple[QPSolution, FloatArray | None]:
     """Go on from a convex step to Newton's, as far as its active set carries.
 
     Args:
         at: The control step.
-        convex: The subproblem, solved.
+        program: The convex program.
+        solution: Its solution.
         leaps: How often in a row the half-spaces were taken ahead of the plan.
 
     Returns:
-        The refined solution, or the convex one; and, for a linear robot, the point (ny,) about
-        which to linearise next where that is not the solution. Empty where there is nothing to
-        refine.
+        The refined solution, or the same where there is none; and, for a linear robot, the point
+        (ny,) about which to linearise next where that is not the solution.
     """
-    solution, nf = convex.solution, len(convex.qp.F)
-    condensed = convex.condensed
+    condensed, nf = program.condensed, len(program.qp.F)
     if not at.linear:
-        W = at.curvature(convex, solution)
+        W = at.curvature(program, solution)
         whole = newton_step(solution, solution.v - condensed.here, W)
-        if whole is not None and holds(convex.qp, whole, _ROUNDING):
-            return whole, None
-        return solution, None
-    bends, push, L = at.bends(convex, solution.force[nf:])
+        return (whole if whole is not None and holds(program.qp, whole) else solution), None
+    bends, push, L = at.bends(program, solution.force[nf:])
     if not len(push):
         return solution, None
     reached = condensed.y(solution.v)
-    moved = reached - convex.planes.y
-    turned = np.einsum("kwm,kw->km", L, moved[convex.pairs.at[push]])
+    moved = reached - program.planes.y
+    turned = np.einsum("kwm,kw->km", L, moved[program.pairs.at[push]])
     whole = summed(solution, bends, turned.ravel())
-    if whole is not None and holds(convex.qp, whole, _ROUNDING):
-        return whole, np.zeros(0)
-    if whole is None:
-        reached = reached + _STRIDE ** (leaps + 1) * moved
-    else:
-        reached = condensed.y(whole.v)
+    if whole is not None and holds(program.qp, whole):
+        return whole, None
+    ahead = reached + _STRIDE ** (leaps + 1) * moved if whole is None else condensed.y(whole.v)
     lower, upper = at.bounds
-    return solution, np.minimum(np.maximum(reached, lower), upper)
+    return solution, np.minimum(np.maximum(ahead, lower), upper)
 
 
-def corrected(convex: Convex, solution: QPSolution, trial: Nominal) -> QPSolution:
+def corrected(program: Program, solution: QPSolution, trial: Nominal) -> QPSolution:
     """The second-order correction: the least change that takes the active pairs back to g = 0.
 
     A step bends away from its linearised constraints by its square, which the merit would hold
     against it wherever it is, also next to the optimum (Maratos, 1978).
     """
-    nf = len(convex.qp.F)
+    nf = len(program.qp.F)
     pairs = solution.indices >= nf
     if not pairs.any() or not np.isfinite(trial.cost):
         return solution
     rows, g = solution.rows, trial.pairs.table(trial.planes.g)
-    at = convex.pairs.obstacle, convex.pairs.node
+    at = program.pairs.obstacle, program.pairs.node
     wanted = np.zeros(len(rows))
     wanted[pairs] = -g[at][solution.indices[pairs] - nf]
     change, *_ = np.linalg.lstsq(rows, wanted)
@@ -163,10 +158,7 @@ def downhill(at: Transcription, saddle: Nominal, direction: FloatArray) -> Nomin
         for sign in (length, -length):
             inputs = saddle.rollout.inputs + sign / largest * direction
             y, rollout = at.rolled(inputs, s)
-            none = np.zeros(len(saddle.force))
-            trial = at.certify(
-                y, rollout, saddle.reaction, saddle.pairs, none, none.astype(np.bool_)
-            )
+            trial = at.nominal(y, rollout, saddle.reaction, saddle.pairs, 0 * saddle.force)
             after = trial.cost + weight * float(np.maximum(-trial.planes.g, 0.0).sum())
             if after < before - _LESS * abs(before):
                 return trial

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 
-from scp_mpc.arrays import FloatArray
+import numpy as np
+
+from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.qp.program import KKTResiduals
 from scp_mpc.scp.certificate import Nominal
-from scp_mpc.scp.history import Record
 from scp_mpc.scp.iterate import Iterate, Multipliers
-from scp_mpc.scp.risk import PlanRisk, plan_risk
 from scp_mpc.scp.step import Step
 
 
@@ -65,6 +65,57 @@ class Candidate:
     side: FloatArray
     time: float
     merit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One SCP iteration.
+
+    Attributes:
+        cost: Of the plan it led to.
+        violation: Largest violation of an obstacle's constraint there [m].
+        residual: Largest KKT residual of the original problem there.
+        step: Norm of what the inputs changed by.
+        accepted: Whether that plan became the next nominal.
+        iterations: ADMM iterations that OSQP took to name the active set; 0 of other solvers.
+        positions: (C+1, d) of the plan, from now on [m].
+        obstacles: (k,) which obstacles push the convex program's solution.
+        normals: (k, d) their half-spaces' normals: n'(p - point) >= -value holds.
+        points: (k, d) about which these were taken [m].
+        values: (k,) of the constraint functions there [m].
+    """
+
+    cost: float
+    violation: float
+    residual: float
+    step: float
+    accepted: bool
+    iterations: int
+    positions: FloatArray
+    obstacles: IntArray
+    normals: FloatArray
+    points: FloatArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRisk:
+    """Upper bounds of the probability that the robot touches an obstacle if it follows the plan.
+
+    They hold for the Gaussians that were predicted, with Boole's inequality over points, stages
+    and obstacles, whatever the correlation between them, and for a robot that is clear now. With
+    `nodes_per_interval=1` they are about the samples only.
+
+    Attributes:
+        stages: (J, N) of touching obstacle j between samples i - 1 and i, which takes one of the
+            points there, the one at i - 1 included, too near.
+        obstacles: (J,) of touching obstacle j at all.
+        joint: Of touching any.
+    """
+
+    stages: FloatArray
+    obstacles: FloatArray
+    joint: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +176,14 @@ class Plan:
     @cached_property
     def risk(self) -> PlanRisk:
         """Bounds of the collision probability, computed when they are asked for."""
-        return plan_risk(self.step, self.iterate)
+        step = self.step
+        path = step.nodes.positions(self.iterate.states, self.iterate.inputs)
+        nodes = step.nodes.stages(step.risks(path))
+        whole, stages = nodes.sum(axis=(1, 2)), nodes.sum(axis=2)
+        if step.problem.nodes_per_interval > 1:  # an interval begins at the node before it
+            stages[:, 1:] += nodes[:, :-1, -step.nodes.discs :].sum(axis=2)
+        joint = min(1.0, float(whole.sum()))
+        return PlanRisk(np.minimum(stages, 1.0), np.minimum(whole, 1.0), joint)
 
     @property
     def multipliers(self) -> Multipliers | None:

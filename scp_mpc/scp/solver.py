@@ -1,13 +1,16 @@
 """The solver of one control step: puts the loop, its starts and what lies below it together.
 
-free plan, which ignores the obstacles: if it is clear of them, nothing can be better
-nominal = previous plan, shifted (or the free plan)
-loop:       half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
-residual of the original problem is below the tolerance, or the time is up
-multi-start: where an obstacle shapes the plan, the same from paths on its other sides;
-the best plan wins, if by enough
-allocate:   where a joint risk is promised, give it to those who need it, and go on
-fallback:   without a plan that meets every constraint, the previous one, or braking
+    free plan, which ignores the obstacles: if it is clear of them, nothing can be better
+    nominal = previous plan, shifted (or the free plan)
+    loop         half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
+                 residual of the original problem is below the tolerance, or the time is up
+    multi-start  where an obstacle shapes the plan, the same from paths on its other sides;
+                 the best plan wins, if by enough
+    allocate     where a joint risk is promised, give it to those who need it, and go on
+    fallback     without a plan that meets every constraint, the previous one, or braking
+
+Between the nodes of a plan radii leave room for what its motion there is assumed to be; a plan that
+moves otherwise is sought again, with what it does for the assumption.
 """
 
 import logging
@@ -23,16 +26,15 @@ from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import QuadraticProgram
+from scp_mpc.safety.margin import JointRisk
 from scp_mpc.scp.allocate import allocate
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.deadline import Clock, Pace
 from scp_mpc.scp.fallback import Fallback
-from scp_mpc.scp.guess import as_iterate
-from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.loop import Loop
 from scp_mpc.scp.multi_start import Found, MultiStart
 from scp_mpc.scp.nodes import Motion, Nodes
-from scp_mpc.scp.obstacle_free import obstacle_free
 from scp_mpc.scp.plan import Plan, Result, Status, Timing
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Relaxation, Transcription
@@ -175,14 +177,14 @@ class SCP:
             at = self._at
             at.begin(step, self.clock())
             if nominal is None:
-                nominal = at.iterate(obstacle_free(at, self._loop, None))
-            about = at.at(nominal)
+                nominal = at.iterate(self._obstacle_free(None))
             if self._between and step.count:
-                at.widen(self._widened(step, self._motion(nominal)))
-                about = at.at(nominal)
+                at.step = self._widened(step, self._motion(nominal))
+            about, path = at.at(nominal), at.outputs(nominal)
+            about = at.at(nominal, about=path)
             give = Relaxation.EVERYBODY if elastic else Relaxation.NOBODY
-            written, _ = at.write(at.condensed(about), about.pairs, about.planes, give)
-            return written.program.copy()
+            program = at.write(about, at.linearise(about), about.pairs.planes(path), give)
+            return program.subproblem.program.copy()
         finally:
             self._busy.release()
 
@@ -222,13 +224,13 @@ class SCP:
     ) -> Plan:
         at = self._at
         at.begin(step, clock)
-        free = obstacle_free(at, self._loop, last)
+        free = self._obstacle_free(last)
         free_motion, wide = None, step
         if self._between and step.count:
             free_motion = self._nodes.motion(*self._trajectory(free, step))
             wide = self._widened(step, free_motion)
         if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
-            at.widen(wide)
+            at.step = wide
             return self._plan(wide, Found(self._loop.result(free)), clock)
         about = at.outputs(last) if path and last is not None else None
         start = at.iterate(free) if last is None else last
@@ -237,13 +239,14 @@ class SCP:
             if free_motion is not None:
                 assumed = self._motion(start).reserved(free_motion, self._nodes.most_deviation)
                 wide = self._widened(step, assumed)
-            at.widen(wide)
+            at.step = wide
             best = self._loop.run(at.at(start, about=about), about=about) if step.count else None
             found = Found(best or self._fallback.best(wide, last))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last is None)
-            found = replace(found, best=allocate(at, self._loop, found.best))
-            ending = clock.elapsed
+            if isinstance(self.problem.margin, JointRisk):
+                found = replace(found, best=allocate(at, self._loop, found.best))
+            ending = clock.elapsed()
             found = replace(found, best=self._rescued(wide, last, found.best))
             if assumed is None or self._is_kept(step, assumed, found.best):
                 break
@@ -252,6 +255,40 @@ class SCP:
             found = replace(found, best=self._exposed(step, found.best))
         plan = self._plan(wide, found, clock)
         clock.learn("ending", ending)
+        return plan
+
+    def _obstacle_free(self, last: Iterate | None) -> Nominal:
+        """The plan that ignores the obstacles: no other costs less, and most steps need no more.
+
+        For a linear robot that is one linear system, or one program where bounds are in the way.
+        For a nonlinear one the loop finds it, from the better of the last plan and the last
+        obstacle-free one, for both lead to local optima only; where an obstacle shaped the last
+        plan, only the sides of the obstacles are sought, and one program about it has to do.
+        """
+        at, limit = self._at, None
+        rest = np.tile(self.problem.model.idle, (self.problem.horizon, 1))
+        if at.linear:
+            s = np.full(self.problem.max_obstacles, self.problem.size.reference)
+            free = at.condenser.condensed(at.condenser.rolled(rest), s).y_free
+            start = at.plain(free[at.layout.u].reshape(rest.shape))
+            (lower, upper), box = at.bounds, at.layout.boxed
+            if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
+                at.firm.solver.finished["kkt"] += 1
+                return start
+            if last is not None and not last.touches:
+                start = at.at(last, at.nobody.near)
+        elif last is None:
+            start = at.plain(rest)
+        else:
+            start = at.plain(last.inputs, last.states[1:] - at.step.x_ref[1:])
+            limit = 1 if last.touches else None
+            if last.free is not None and not last.touches:
+                other = at.plain(last.free)
+                merits = [at.merit(p.cost, 0.0, p.excess) for p in (start, other)]
+                start = other if merits[1] < merits[0] else start
+        found = self._loop.run(start, limit=limit, screen=False)
+        plan = start if found is None or found.nominal is None else found.nominal
+        at.free = None if at.linear else plan.rollout.inputs
         return plan
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result) -> Result:
@@ -307,7 +344,7 @@ class SCP:
         slack = iterate.slack[: step.count]
         if step.nodes.count > 1:
             slack = frozen(step.nodes.stages(slack).max(axis=2, initial=0.0))
-        finished = self._at.finished if best.nominal is not None or found.tried else {}
+        finished = self._at.firm.solver.finished + self._at.elastic.solver.finished
         return Plan(
             X=iterate.states,
             U=iterate.inputs,
@@ -325,7 +362,7 @@ class SCP:
                 linearise=clock.spent["linearise"],
                 update=clock.spent["update"],
                 solve=clock.spent["solve"],
-                total=clock.elapsed,
+                total=clock.elapsed(),
             ),
             iterate=iterate,
             history=best.history,

@@ -20,6 +20,7 @@ from scp_mpc.problem import Problem
 from scp_mpc.safety.margin import Margin
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.safety.polytopes import Polytopes
+from scp_mpc.safety.risk import risk_bound
 from scp_mpc.scp.nodes import Nodes
 
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
@@ -175,10 +176,6 @@ class Step:
         """The same with sizes (J, C) of their own at all points."""
         return replace(self, scale=sizes / self.problem.size.reference)
 
-    def unscaled(self) -> "Step":
-        """The same with covariances as they were predicted."""
-        return self if self.scale is None else replace(self, scale=None)
-
     def within(
         self,
         positions: FloatArray,
@@ -258,10 +255,13 @@ class Step:
             depths[j, i] = np.maximum(0.0, -g[:, 0])
         return depths
 
-    def conflicts(self, path: FloatArray, s: FloatArray) -> BoolArray:
-        """Which no-go sets a path (C, d) enters at sizes s (M,): (J, C)."""
-        inside: BoolArray = self.depths(path, s) > 0
-        return inside
+    def risks(self, path: FloatArray) -> FloatArray:
+        """Half-space bounds (J, C) of the risks along a path (C, d), for covariances as predicted."""
+        if not self.count:
+            return np.zeros((0, self.nodes.size))
+        plain = self if self.scale is None else replace(self, scale=None)
+        given = plain.means[:, 1:], plain.covariances[:, 1:], self.radii, self.count, self.shapes
+        return risk_bound(NoGoSets.stacked(*given), path)
 
 
 def _squared(vectors: FloatArray) -> FloatArray:

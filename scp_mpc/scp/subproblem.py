@@ -51,6 +51,7 @@ class Subproblem:
 
     Attributes:
         program: The values as last written.
+        about: The plan that the dynamics were last written about in this control step; or None.
         solver: Solves it.
     """
 
@@ -84,8 +85,7 @@ class Subproblem:
         self.program = QuadraticProgram(self._hessian(), q, A, lower, upper)
         self._blocks = _stage_blocks(self.program.P, N, model.nx, model.nu)
         self._plain = self.program.P.data.copy()
-        self._rows_of_slots = np.full(spaces, -1, dtype=np.intp)
-        self._slot = np.zeros(0, dtype=np.intp)
+        self.about: Rollout | None = None
         self._linear = isinstance(model, LinearModel)
         if isinstance(model, LinearModel):
             at = np.zeros((N, 1, 1))
@@ -102,7 +102,7 @@ class Subproblem:
         right[1:] -= (A[1:] @ e[:-1, :, None])[..., 0]
         self.program.lower[self._dynamics] = self.program.upper[self._dynamics] = right.ravel()
         rest = about.positions.ravel() - about.along.moved(e[..., None], u[..., None])[:, 0]
-        self._rest = rest
+        self._rest, self.about = rest, about
         if self._linear:
             return
         self.program.P.data[:] = self._plain
@@ -206,11 +206,9 @@ class Subproblem:
             y[self._pins] = pins
         return z, y
 
-    def plan(self, z: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inputs (N, nu) and sizes (M,) in z; `s` holds those that do not move."""
-        sizes = s.copy()
-        sizes[: self._layout.moving] = z[self._s]
-        return z[self._u].reshape(self._layout.shape), sizes
+    def box(self, z: FloatArray) -> FloatArray:
+        """Sizes that move and inputs (nv,) in z."""
+        return np.concatenate([z[self._s], z[self._u]])
 
     def _assigned(self, node: IntArray, room: FloatArray) -> tuple[IntArray, IntArray]:
         """Which pairs get a slot, and which: the nearest ones at each node."""

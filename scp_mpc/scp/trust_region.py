@@ -11,12 +11,19 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.qp.active_set import QPSolution
 from scp_mpc.scp.certificate import Nominal
-from scp_mpc.scp.transcription import Convex, Relaxation, Transcription
+from scp_mpc.scp.transcription import Program, Relaxation, Transcription
+
+_ENOUGH = 0.01  # share of the predicted decrease that a trial must bring
+_SHRINK, _GROW = 0.3, 3.0
+_SMALLEST = 1e-8  # relative to the inputs' range, at which to give up
+_CLOSE = 1e-2  # KKT residual from which on its fall counts, whatever the merit does
+_NOISE = 1e-12  # of the merit, relative
 
 
 class Region:
-    """The trust region and the merit that decides about it.
+    """A trust region and its merit.
 
     Args:
         at: The step in numbers.
@@ -25,31 +32,21 @@ class Region:
         radius: (N nu,) by how much inputs may change; None for no limit.
     """
 
-    enough = 0.01  # share of the predicted decrease that a trial must bring
-    shrink, grow = 0.3, 3.0
-    smallest = 1e-8  # relative to the inputs' range, at which to give up
-    close = 1e-2  # KKT residual from which on its fall counts, whatever the merit does
-    noise = 1e-12  # of the merit, relative
-
     def __init__(self, at: Transcription) -> None:
         """Begin without limits."""
-        self._at = at
         span = (at.problem.u_max - at.problem.u_min) / 2
-        self._span = np.tile(np.where(span > 0, span, 1.0), at.problem.horizon)
-        self._radius, self._weight = inf, 0.0
-
-    @property
-    def radius(self) -> FloatArray | None:
-        """See above."""
-        return None if self._radius == inf else self._radius * self._span
+        self._at, self._span = at, np.tile(np.where(span > 0, span, 1.0), at.problem.horizon)
+        self._size, self._weight = inf, 0.0
+        self.radius: FloatArray | None = None
 
     def accepts(
         self,
         nominal: Nominal,
         best: Nominal | None,
         trial: Nominal,
-        convex: Convex,
-        solution: object,
+        program: Program,
+        solution: QPSolution,
+        refinement: QPSolution,
         leaps: int,
     ) -> bool:
         """Whether a trial brings enough of what its program predicted."""
@@ -57,35 +54,37 @@ class Region:
         if not np.isfinite(trial.cost):
             return False
         if at.linear:
-            return not leaps or best is None or self._merit(trial) <= self._merit(best)
-        forces = convex.solution.force[len(convex.qp.F) :]
-        largest = float(np.abs(forces).max(initial=0.0))
+            if not leaps or best is None:
+                return True
+            self._weight = at.problem.slack_weight
+            return self._merit(trial) <= self._merit(best)
+        largest = float(np.abs(solution.force[len(program.qp.F) :]).max(initial=0.0))
         self._weight = min(max(self._weight / 2, 2 * largest), at.problem.slack_weight)
-        if convex.relaxation is Relaxation.EVERYBODY:
+        if program.give is Relaxation.EVERYBODY:
             self._weight = at.problem.slack_weight
         before, after = self._merit(nominal), self._merit(trial)
-        predicted, actual = before - self._model(convex, solution), before - after
-        if actual >= self.enough * predicted - self.noise * abs(before):
-            if actual >= predicted / 2:
-                self._radius *= self.grow
+        d = refinement.v - program.condensed.here
+        bent = float(d @ at.curvature(program, solution) @ d) / 2
+        predicted = before - program.qp.merit(refinement.v) - bent
+        if before - after >= _ENOUGH * predicted - _NOISE * abs(before):
+            if before - after >= predicted / 2:
+                self._resize(_GROW * self._size)
             return True
         worst = nominal.residuals.worst if best is not None else inf
-        return trial.residuals.worst <= worst / 2 <= self.close
+        return trial.residuals.worst <= worst / 2 <= _CLOSE
 
-    def shrinks(self, nominal: Nominal, convex: Convex, solution: object) -> bool:
+    def shrinks(self, nominal: Nominal, program: Program, refinement: QPSolution) -> bool:
         """Trust only a part of the way that the inputs were to go; False where that is none."""
-        y = convex.condensed.y(solution.v)  # type: ignore[attr-defined]
-        change = (y - nominal.y)[self._at.layout.u] / self._span
-        self._radius = self.shrink * min(self._radius, float(np.abs(change).max()))
-        return self._radius >= self.smallest
+        u = self._at.layout.u
+        change = (program.condensed.y(refinement.v)[u] - nominal.y[u]) / self._span
+        self._resize(_SHRINK * min(self._size, float(np.abs(change).max())))
+        return self._size >= _SMALLEST
 
-    def _model(self, convex: Convex, solution: object) -> float:
-        v = solution.v  # type: ignore[attr-defined]
-        d = v - convex.condensed.here
-        return convex.qp.merit(v) + float(d @ self._at.curvature(convex, convex.solution) @ d) / 2
+    def _resize(self, size: float) -> None:
+        self._size = size
+        self.radius = None if size == inf else size * self._span
 
     def _merit(self, nominal: Nominal) -> float:
         """Cost and penalties on all violations, whoever is supposed to yield."""
-        merit = self._at.merit(nominal.cost, 0.0, nominal.excess)
-        weight = self._at.problem.slack_weight if self._at.linear else self._weight
-        return merit + weight * float(np.maximum(0.0, -nominal.planes.g).sum())
+        depth = float(np.maximum(0.0, -nominal.planes.g).sum())
+        return self._at.merit(nominal.cost, 0.0, nominal.excess) + self._weight * depth
