@@ -7,8 +7,7 @@ from instances import S_REF, problem
 
 from scp_mpc import ObstaclePrediction
 from scp_mpc.obstacles import Polytope
-from scp_mpc.scp.candidates import Passing, candidates, same_way
-from scp_mpc.scp.candidates import Walls
+from scp_mpc.scp.candidates import Passing, Walls, candidates, same_way
 from scp_mpc.scp.step import Step
 
 N = 8

@@ -22,7 +22,6 @@ from scp_mpc import (
 from scp_mpc.safety import NoGoSets, containment_size, risk_bound, size_at_risk
 from scp_mpc.safety.allocation import reallocated
 
-
 S95 = 5.991**0.5
 
 

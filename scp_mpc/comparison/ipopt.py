@@ -25,8 +25,7 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.safety.ellipsoid import signed_distance
 from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.scp.iterate import as_iterate
-from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory
 

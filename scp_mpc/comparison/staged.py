@@ -23,8 +23,7 @@ from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.scp.iterate import as_iterate
-from scp_mpc.scp.iterate import Iterate
+from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.trajectory import Trajectory
 
 _QUIET = {"print_time": False, "show_eval_warnings": False}

@@ -358,14 +358,15 @@ def _independent(
     rank = int(np.count_nonzero(pivots > _DEPENDENT * pivots[0]))
     along = solve_triangular(R[:rank, :rank], wanted[order[:rank]], trans=1)
     point = Q[:, :rank] @ along
-    keep, force = order[:rank], solve_triangular(R[:rank, :rank], along)
-    if rank == len(rows):
-        return keep, R, force, point
+    keep = np.array(order[:rank], dtype=np.intp)
+    force = np.array(solve_triangular(R[:rank, :rank], along), dtype=np.float64)
+    factor = np.array(R[:rank, :rank], dtype=np.float64)
     met = np.flatnonzero(np.abs(rows @ point - wanted) <= _ACCURACY)
-    if not len(met):
-        return keep, R[:rank, :rank], force, point
+    if rank == len(rows) or not len(met):
+        return keep, factor, force, point
     push, missed = nnls((rows[met] * sign[met, None]).T, point, maxiter=30 * len(rows))
     if missed > _ACCURACY * max(1.0, float(np.linalg.norm(point))) or not push.any():
-        return keep, R[:rank, :rank], force, point
-    keep, force = met[push > 0], (sign[met] * push)[push > 0]
-    return keep, qr(rows[keep].T, mode="r")[0][: len(keep)], force, point
+        return keep, factor, force, point
+    keep, force = met[push > 0], np.array((sign[met] * push)[push > 0], dtype=np.float64)
+    factor = np.array(qr(rows[keep].T, mode="r")[0][: len(keep)], dtype=np.float64)
+    return keep, factor, force, point

@@ -6,8 +6,8 @@
     until    there is one, or multipliers prove that there is none, or the runs are used up
     rescue:  PIQP, judged in the same way
 
-What a solver returns is never taken as it is: `active_set.py` solves with the program's own data and
-checks every constraint and every force.
+What a solver returns is never taken as it is: `active_set.py` solves with the program's own data,
+and checks every constraint and every force.
 """
 
 from collections import Counter

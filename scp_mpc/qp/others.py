@@ -49,7 +49,7 @@ class PIQP(Backend):
         given = program.P, program.q, self._equations, program.lower[self._e]
         self._solver.setup(*given, self._inequalities, zero - 1, zero + 1)
 
-    def load(self, start: tuple[FloatArray, FloatArray]) -> None:
+    def load(self, start: tuple[FloatArray, FloatArray]) -> None:  # noqa: ARG002
         """See the base class; the start is of no use."""
         program, e, i = self._program, self._e, self._i
         self._equations.data[:] = program.A.data[self._e_places]
@@ -120,12 +120,12 @@ def installed() -> list[str]:
 def known() -> list[str]:
     """Names of all solvers that qpsolvers has an interface to."""
     solvers = qpsolvers.dense_solvers + qpsolvers.sparse_solvers
-    return sorted({*solvers, *_KNOWN} - {"osqp", "piqp"})
+    return sorted({*solvers, *_KNOWN.split()} - {"osqp", "piqp"})
 
 
-# what qpsolvers has interfaces to and packages for, installed or not
-_KNOWN = ("clarabel", "cvxopt", "daqp", "ecos", "gurobi", "highs", "mosek", "proxqp", "quadprog")
-_KNOWN += ("qpalm", "scs", "qpax", "hpipm", "kvxopt", "nppro", "jaxopt_osqp", "sip", "copt")
+# What qpsolvers has interfaces to and packages for, installed or not.
+_KNOWN = "clarabel copt cvxopt daqp ecos gurobi highs hpipm jaxopt_osqp kvxopt mosek nppro proxqp"
+_KNOWN += " qpalm qpax quadprog scs sip"
 
 
 def _part(A: sparse.csc_matrix, indices: IntArray) -> tuple[sparse.csc_matrix, IntArray]:

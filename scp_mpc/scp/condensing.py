@@ -6,8 +6,8 @@ linearised about the present plan where they are nonlinear, is
     y = y_free + S v,        cost = least + |v|^2 / 2
 
 where y_free is the plan that nothing constrains, and v are its inputs (and sizes). With Hessian
-H = 2 (R + G'QG) = L L' and gradient g at the present plan, u = u_free + L^-T v, and the present plan
-is at v = L^-1 g. A linear robot is the case where G, L and S stay: they are computed once.
+H = 2 (R + G'QG) = L L' and gradient g at the present plan, u = u_free + L^-T v, and the present
+plan is at v = L^-1 g. A linear robot is the case where G, L and S stay: they are computed once.
 
 Plans are always rolled out, so that there are no defects. Rolling out is Newton's method on all
 stages at once, x <- x + D^-1 (f(x, u) - x_next), which for a linear robot takes one step.
@@ -32,7 +32,7 @@ from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
 from scp_mpc.robots.linear import LinearModel
 from scp_mpc.scp.layout import Layout
-from scp_mpc.scp.nodes import LinearNodes, Nodes
+from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 
 _CLOSED = 1e-12  # defect that is none, relative to the largest state
@@ -201,13 +201,13 @@ class Condenser:
             nodes,
             layout,
         )
-        N, nu = layout.shape
+        N = layout.shape[0]
         self._effort = np.kron(np.eye(N), 2 * problem.R)
         self.linear = isinstance(problem.model, LinearModel)
         if isinstance(problem.model, LinearModel):
-            assert isinstance(nodes, LinearNodes)
             A, B = (np.repeat(M[None], N, axis=0) for M in (problem.model.A, problem.model.B))
-            self._always = Derivatives(A, B, *nodes.slopes)
+            rest = np.zeros((N + 1, problem.model.nx)), np.zeros((N, problem.model.nu))
+            self._always = Derivatives(A, B, *nodes.derivatives(*rest)[1:])
             self._sensitivity = self._sensitivity_along(self._always)
         elif np.linalg.eigvalsh(problem.R)[0] <= 0:
             raise InvalidArgumentError("R", "is singular, which a nonlinear model does not allow")

@@ -23,6 +23,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.active_set import QPSolution
+from scp_mpc.qp.program import KKTResiduals
 from scp_mpc.scp.candidates import Passing, same_way
 from scp_mpc.scp.certificate import BENT, Nominal
 from scp_mpc.scp.iterate import NEGLIGIBLE
@@ -143,14 +144,10 @@ class Loop:
     ) -> Result:
         """Judge a plan."""
         at, residuals, tolerance = self._at, nominal.residuals, self._settings.tolerance
-        most = max(nominal.slack.max(initial=0.0), nominal.excess.max(initial=0.0))
-        inside = not (residuals.feasibility <= tolerance and most <= tolerance)  # or NaN
-        certified = residuals.worst <= tolerance and most == most
-        if certified and not residuals.curvature < -BENT:
-            status, slack = Status.SOFTENED if inside else Status.CONVERGED, nominal.slack
-        else:
-            status = Status.VIOLATING if inside else Status.FEASIBLE
-            slack = np.maximum(-nominal.planes.g, 0.0) if inside else nominal.slack
+        most = float(max(nominal.slack.max(initial=0.0), nominal.excess.max(initial=0.0)))
+        status, slack = judge(residuals, most, tolerance), nominal.slack
+        if not status.certified and residuals.feasibility > tolerance:
+            slack = np.maximum(-nominal.planes.g, 0.0)
         merit = at.merit(nominal.cost, float(slack.sum()), nominal.excess)
         soft = give is Relaxation.EVERYBODY
         iterate = at.iterate(nominal, at.problem.slack_weight if soft else inf)
@@ -191,3 +188,12 @@ class Loop:
             points=at.path(planes.y)[pairs.node[push] + 1],
             values=planes.g[push],
         )
+
+
+def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
+    """Return the status of a plan with the given residuals and largest slack."""
+    inside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
+    certified = residuals.worst <= tolerance and slack == slack
+    if certified and not residuals.curvature < -BENT:
+        return Status.SOFTENED if inside else Status.CONVERGED
+    return Status.VIOLATING if inside else Status.FEASIBLE

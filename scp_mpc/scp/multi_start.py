@@ -197,10 +197,10 @@ class MultiStart:
             v, force = qp.unbox @ (subproblem.box(z) - free), rows.forces(y)
         reached = condensed.y(v)
         nf = len(qp.F)
-        push = program.pairs.table(force[nf:] > NEGLIGIBLE)
+        push = program.pairs.table(force[nf:]) > NEGLIGIBLE
         y, rollout = at.rolled(reached[at.layout.u].reshape(at.layout.shape), reached[at.layout.s])
-        start = at.nominal(y, rollout, force[:nf], program.pairs, force[nf:])
-        return Ranked(merit, Passing(at.path(reached)[1:], push), about, start)
+        seen = at.nominal(y, rollout, force[:nf], program.pairs, force[nf:])
+        return Ranked(merit, Passing(at.path(reached)[1:], push), about, seen)
 
     def _searched(
         self,

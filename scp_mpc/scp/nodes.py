@@ -193,10 +193,9 @@ class LinearNodes(Nodes):
         self._most = float(np.linalg.norm(np.abs(bend_u) @ none, axis=1).max())
         at = np.zeros((horizon, d, model.nx))
         at[:, np.arange(d), self._position] = 1.0
-        between = None
-        if K > 1:
-            between = tuple(np.repeat(part[None], horizon, axis=0) for part in (self._C, self._D))
-        self.slopes = between, at
+        C, D = (np.repeat(part[None], horizon, axis=0) for part in (self._C, self._D))
+        self._slopes: tuple[tuple[FloatArray, FloatArray] | None, FloatArray]
+        self._slopes = None if K == 1 else (C, D), at
 
     def positions(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """See the base class."""
@@ -210,7 +209,7 @@ class LinearNodes(Nodes):
         self, states: FloatArray, inputs: FloatArray
     ) -> tuple[FloatArray, tuple[FloatArray, FloatArray] | None, FloatArray]:
         """See the base class."""
-        return self.positions(states, inputs), *self.slopes
+        return self.positions(states, inputs), *self._slopes
 
     def deviation(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """See the base class; at the middle between two instants."""

@@ -57,8 +57,8 @@ class Candidate:
         obstacle: Index of the obstacle that it was to pass on another side.
         side: (d,) direction from the obstacle to where it passes.
         time: Stages by which it was to pass earlier than the plan that ignores the obstacles.
-        merit: Lower bound of the first program about it, cost and penalty on slack; infinite if that
-            program has no solution without slack, or none that can win.
+        merit: Lower bound of the first program about it, cost and penalty on slack; infinite if
+            that program has no solution without slack, or none that can win.
     """
 
     obstacle: int
@@ -133,12 +133,12 @@ class Plan:
         status: How it ended.
         kkt: Residuals of the original problem's KKT conditions at this plan.
         iterations: Steps of the descent that led to this plan.
-        qps: Quadratic programs in this control step by who finished them: the solver that was asked,
-            "osqp" by default, whose active set was exact after one repair at most; "repaired" where
-            it took more; "piqp", the rescue; "kkt", a linear system, where nothing but the dynamics
-            constrains the plan. And those that nobody finished: "ranked", an alternative whose
-            optimum was bounded from below; "cut", one that cannot win; "infeasible", one that was
-            proved to have no solution.
+        qps: Quadratic programs in this control step by who finished them: the solver that was
+            asked, "osqp" by default, whose active set was exact after one repair at most;
+            "repaired" where it took more; "piqp", the rescue; "kkt", a linear system, where nothing
+            but the dynamics constrains the plan. And those that nobody finished: "ranked", an
+            alternative whose optimum was bounded from below; "cut", one that cannot win;
+            "infeasible", one that was proved to have no solution.
         candidates: Rival plans on other sides that were tried; `switched` if one of them won.
         timing: Seconds spent.
         iterate: The point with its multipliers, padded to all obstacle slots, at all nodes.

@@ -256,7 +256,7 @@ class Step:
         return depths
 
     def risks(self, path: FloatArray) -> FloatArray:
-        """Half-space bounds (J, C) of the risks along a path (C, d), for covariances as predicted."""
+        """Half-space bounds (J, C) of the risks along a path (C, d), for what was predicted."""
         if not self.count:
             return np.zeros((0, self.nodes.size))
         plain = self if self.scale is None else replace(self, scale=None)

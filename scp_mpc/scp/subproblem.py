@@ -151,9 +151,9 @@ class Subproblem:
             slope = np.zeros((nodes.size * S, layout.moving))
             slope[slot, pairs.obstacle[kept]] = planes.a[kept, d]
             data[self._places["slopes"]] = slope.ravel()
-        at = pairs.at[kept]
-        moved = planes.y[at]
-        moved[:, :d] -= self._rest[at[:, :d]]
+        places = pairs.at[kept]
+        moved = planes.y[places]
+        moved[:, :d] -= self._rest[places[:, :d]]
         offset = np.add.reduce(planes.a[kept] * moved, axis=1) - planes.g[kept]
         if not layout.moving:
             offset -= planes.a[kept, d] * moved[:, d]
@@ -250,9 +250,9 @@ class Subproblem:
         sizes = np.arange(self._s.start, self._s.stop)
         blocks.add("s", sizes, sizes, 2 * problem.size.weight)
         if not linear:
-            cross = (state[:-1] + x[:, None], control[1:] + u)
-            blocks.add("ex", *cross, 0.0)
-            blocks.add("xe", *(np.swapaxes(np.broadcast_arrays(*cross), -1, -2)[::-1]), 0.0)
+            rows, columns = np.broadcast_arrays(state[:-1] + x[:, None], control[1:] + u)
+            blocks.add("ex", rows, columns, 0.0)
+            blocks.add("xe", columns, rows, 0.0)
         n = self._slack.stop
         return blocks.build((n, n))[0]
 
