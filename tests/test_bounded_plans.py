@@ -15,7 +15,6 @@ from scp_mpc.comparison.audit import audit
 from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.nodes import Nodes
-from scp_mpc.scp.obstacle_free import obstacle_free
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Transcription
 from scp_mpc.trajectory import rollout
@@ -74,11 +73,10 @@ def test_excess_is_slack_where_it_is_paid_for_and_a_violation_where_not():
     force = np.zeros((N, 3))
     force[states[1:, 1:] > this.x_max[1:]] = -100.0
     force[states[1:, 1:] < this.x_min[1:]] = 100.0
-    nobody, none = at.nobody, np.zeros(0)
     for share, violation in ((1.0, 0.0), (0.5, excess.max())):
         layout, empty = at.layout, np.zeros((0, 0))
         reaction = layout.gathered(np.zeros(1), np.zeros((N, 2)), empty, share * force)
-        paid = at.certify(plain.y, plain.rollout, reaction, nobody, none, np.zeros(0, dtype=bool))
+        paid = at.nominal(plain.y, plain.rollout, reaction, at.nobody, np.zeros(0))
         np.testing.assert_allclose(paid.excess, excess[:, 1:].ravel(), atol=1e-12)
         assert paid.residuals.feasibility == pytest.approx(violation, abs=1e-12)
         price = at.merit(paid.cost, 0.0, paid.excess) - paid.cost
@@ -240,7 +238,7 @@ def test_the_merit_includes_the_price_of_the_excess():
     solver = SCP(this)
     at, loop = solver._at, solver._loop
     at.begin(Step.read(this, ref[0], ref, [], nodes=at.nodes), Clock())
-    end = loop.run(obstacle_free(at, loop, None))
+    end = loop.run(solver._obstacle_free(None))
     assert end.merit - end.cost == pytest.approx(100.0 * (0.8 + 0.6 + 0.4 + 0.2))
 
 

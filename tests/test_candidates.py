@@ -13,6 +13,11 @@ N = 20
 S = np.array([S_REF])
 
 
+def conflicts(step, path, s):
+    """Which no-go sets a path (C, d) enters: (J, C)."""
+    return step.depths(path, s) > 0
+
+
 def ways(case, reference, obstacles, present=None):
     """Ways past, about a plan that follows the reference."""
     step = Step.read(case, reference[0], reference, obstacles)
@@ -27,7 +32,7 @@ def test_the_free_plans_own_time_passes_left_and_right():
     blocking = obstacle(N, (3.0, 0.1), (0.5, 0.0), rotated((0.4, 0.1), 0.7))
     step, found = ways(case, ref, [blocking])
     free = ref[1:, [0, 2]]
-    inside = step.conflicts(free, S)[0]
+    inside = conflicts(step, free, S)[0]
     assert 2 < inside.sum() < N
     left, right = (side for side in found if side.time == 0)
     for side in (left, right):
@@ -44,7 +49,7 @@ def test_the_free_plans_own_time_passes_left_and_right():
 def test_no_way_leads_through_the_conflict(inflation):
     case, ref = problem(N, inflation), straight_reference(N)
     step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
-    stages = np.flatnonzero(step.conflicts(ref[1:, [0, 2]], S)[0])
+    stages = np.flatnonzero(conflicts(step, ref[1:, [0, 2]], S)[0])
     assert {side.time for side in found} == {0.0, -1.0, 1.0, -2.0}
     assert len(found) == 8
     for side in found:
@@ -58,7 +63,7 @@ def test_the_first_conflict_comes_first_and_others_keep_the_present_plan():
     near, far = obstacle(N, (2.0, 0.0)), obstacle(N, (6.0, 0.0))
     present = ref[1:, [0, 2]] + [0.0, 1.5]
     step, found = ways(case, ref, [far, near], present)
-    conflict = step.conflicts(ref[1:, [0, 2]], np.full(2, S_REF))
+    conflict = conflicts(step, ref[1:, [0, 2]], np.full(2, S_REF))
     assert [side.obstacle for side in found] == [1] * 8 + [0] * 8
     for side in found[:8]:
         np.testing.assert_array_equal(side.path[conflict[0]], present[conflict[0]])
@@ -118,7 +123,7 @@ def test_keeping_pace_with_the_obstacle_still_gives_sides(inflation):
 def test_the_same_way_is_the_same_stages_on_the_same_side():
     case, ref = problem(N, "exact"), straight_reference(N)
     step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
-    touched = step.conflicts(ref[1:, [0, 2]], S)
+    touched = conflicts(step, ref[1:, [0, 2]], S)
     left, right = (Passing(side.path, touched) for side in found if side.time == 0)
     assert same_way(step, left, left)
     assert not same_way(step, left, right)
@@ -147,7 +152,7 @@ def test_rivals_begin_at_the_state_not_at_the_reference(monkeypatch):
 
     def noting(*given):
         found = rank(*given)
-        starts.extend(search._start(one).rollout for one in found if np.isfinite(one.merit))
+        starts.extend(one.start.rollout for one in found if one.start is not None)
         return found
 
     monkeypatch.setattr(search, "_rank", noting)

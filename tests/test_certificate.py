@@ -305,7 +305,7 @@ def test_the_second_derivative_is_that_of_the_rolled_out_cost(name):
     at = Transcription(case, Settings(), Nodes.of(case))
     at.begin(Step.read(case, x0, x_ref, [], nodes=at.nodes), Clock())
     U = case.limited(model.idle + 0.2 * rng.normal(size=(N, model.nu)))
-    least, _ = at.second_order(at.plain(U))[:2]
+    least = at.second_order(at.plain(U))[0].residuals.curvature
 
     def errors(u):
         return (rollout(model.step, x0, u.reshape(N, -1)).states - x_ref)[1:].ravel()

@@ -110,7 +110,7 @@ def test_tangents_complete_a_basis(dim):
 
 def plain(monkeypatch):
     """Take away the sums and the leaps: convex steps only."""
-    monkeypatch.setattr(loop, "refined", lambda _, convex, __: (convex.solution, None))
+    monkeypatch.setattr(loop, "refined", lambda _, __, solution, ___: (solution, None))
 
 
 @pytest.mark.parametrize("inflation", ["exact", "axes"])

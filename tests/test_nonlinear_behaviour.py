@@ -107,7 +107,7 @@ def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
         accepted = inner(self, nominal, best, trial, *args)
         worst = np.inf if best is None else nominal.residuals.worst
         verdicts.append((accepted, self._merit(nominal) - self._merit(trial), trial, worst))
-        radii.append(self._radius)
+        radii.append(np.inf if self.radius is None else self.radius.max())
         return accepted
 
     monkeypatch.setattr(Region, "accepts", watched)

@@ -323,14 +323,14 @@ def test_a_leap_that_costs_more_is_taken_back(aside, monkeypatch):
     guess = Trajectory(case.x_ref, np.zeros((20, 2)))
     given = case.x0, case.x_ref, case.obstacles, guess
     with monkeypatch.context() as plain:
-        plain.setattr(loop, "refined", lambda _, convex, __: (convex.solution, None))
+        plain.setattr(loop, "refined", lambda _, __, solution, ___: (solution, None))
         expected = SCP(case.problem, settings).solve(*given)
     rejected, accepts = [], Region.accepts
 
-    def astray(at, convex, leaps):  # noqa: ARG001
-        ahead = convex.condensed.y(convex.solution.v)
+    def astray(at, program, solution, leaps):  # noqa: ARG001
+        ahead = program.condensed.y(solution.v)
         ahead[at.layout.p][1::2] += aside
-        return convex.solution, ahead
+        return solution, ahead
 
     def counting(self, *trial):
         accepted = accepts(self, *trial)

@@ -129,7 +129,7 @@ def test_who_is_near_is_found(seed):
     known = rng.random((3, N)) < 0.5
     unknown = step.within(path, s, 0.5, known)
     assert unknown is None or not (unknown & known).any()
-    np.testing.assert_array_equal(step.conflicts(path[1:], s), g < 0)
+    np.testing.assert_array_equal(step.depths(path[1:], s) > 0, g < 0)
     np.testing.assert_allclose(step.depths(path[1:], s), np.maximum(0, -g), atol=1e-12)
 
 

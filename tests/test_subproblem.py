@@ -13,6 +13,7 @@ from scp_mpc import SCP, DoubleIntegrator, Margin, ObstaclePrediction, Settings,
 from scp_mpc.obstacles import Polytope
 from scp_mpc.qp.sparse_blocks import SparseBlocks
 from scp_mpc.scp.deadline import Clock
+from scp_mpc.scp.pairs import Pairs
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Relaxation, Transcription
 from scp_mpc.trajectory import rollout
@@ -232,25 +233,26 @@ def begun(case="bounds", **changes):
     rng, plan = np.random.default_rng(0), about(this, x0)
     y, rolled = at.rolled(plan.inputs, rng.uniform(0.5, 2.0, 2))
     everybody = np.ones(at.step.radii.shape, dtype=bool)
-    pairs = at.renewed(at.plain(plan.inputs), type(at.nobody)(at.step, at.layout, everybody)).pairs
+    pairs = Pairs(at.step, at.layout, everybody)
     reaction = rng.normal(size=at.layout.size - at.layout.boxed.start)
     force = rng.uniform(size=len(pairs.node))
-    nominal = at.certify(y, rolled, reaction, pairs, force, np.zeros(len(force), dtype=bool))
-    return at, nominal
+    return at, at.nominal(y, rolled, reaction, pairs, force)
 
 
 @pytest.mark.parametrize("give", list(Relaxation))
 @pytest.mark.parametrize("case", ["plane", "bounds", "bicycle"])
 def test_a_start_and_what_is_read_from_it_are_inverse(case, give):
     at, nominal = begun(case)
-    written = at.write(at.condensed(nominal), nominal.pairs, nominal.planes, give)
-    subproblem, rows = written
-    z, y = at.start(subproblem, nominal)
-    inputs, sizes = subproblem.plan(z, nominal.y[at.layout.s])
-    np.testing.assert_array_equal(inputs, nominal.rollout.inputs)
-    np.testing.assert_array_equal(sizes, nominal.y[at.layout.s])
-    np.testing.assert_array_equal(z[: nominal.rollout.deviations.size].reshape(N, -1),
-                                  nominal.rollout.deviations)  # fmt: skip
+    program = at.write(nominal, at.linearise(nominal), nominal.planes, give)
+    rows, (z, y) = program.rows, at.start(program, nominal)
+    nx, nu = at.problem.model.nx, at.problem.model.nu
+    deviations, inputs, rest = np.split(z, [N * nx, N * (nx + nu)])
+    np.testing.assert_array_equal(inputs.reshape(N, nu), nominal.rollout.inputs)
+    np.testing.assert_array_equal(deviations.reshape(N, nx), nominal.rollout.deviations)
+    moving = at.layout.moving
+    np.testing.assert_array_equal(rest[:moving], nominal.y[at.layout.s][:moving])
+    boxed = nominal.y[at.layout.boxed][: moving + N * nu]
+    np.testing.assert_array_equal(program.subproblem.box(z), boxed)
     forces = np.concatenate([nominal.reaction, nominal.force])
     np.testing.assert_array_equal(rows.forces(y), forces)
     np.testing.assert_array_equal(y[: nominal.costates.size].reshape(N, -1), nominal.costates)
@@ -264,7 +266,7 @@ def test_what_rounding_lets_through_is_clipped():
     for inputs, bound in ((high, this.u_max), (-high, this.u_min)):
         y, rolled = at.rolled(inputs, np.full(2, 99.0 * np.sign(inputs[0, 0])))
         assert (rolled.inputs == bound).all()
-        assert (at.inputs(y) == bound).all()
+        assert (y[at.layout.u].reshape(N, 2) == bound).all()
         size = this.size
         assert (y[at.layout.s] == (size.upper if inputs is high else size.lower)).all()
 

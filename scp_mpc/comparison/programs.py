@@ -84,7 +84,9 @@ def _row(
 def _solved(name: str, program: QuadraticProgram) -> tuple[FloatArray, FloatArray] | None:
     """A solver's point and multipliers from zero, or None."""
     point = None
-    solver = backend(program, np.flatnonzero(program.lower == program.upper), name, QPSettings())
+    solver = backend(
+        program, np.flatnonzero(program.lower == program.upper), name, QPSettings(rho=(10.0,))
+    )
     solver.load((np.zeros(len(program.q)), np.zeros(len(program.lower))))
     if name != "osqp":
         return solver.run(1)
