@@ -7,7 +7,8 @@ Notation:
     nb              states with a finite bound, `Problem.bounded_states`
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,6 +68,8 @@ class Iterate:
         slack: Violations.
         multipliers: Those of all constraints, or None.
         free: (N, nu) inputs of the plan that ignores the obstacles; nonlinear robots' only.
+        alternatives: Multipliers (N, nu) of the input bounds and (M, C) of the obstacles, of the
+            programs of other ways past them, by obstacle and number; see `multi_start.py`.
     """
 
     states: FloatArray
@@ -75,6 +78,9 @@ class Iterate:
     slack: FloatArray
     multipliers: Multipliers | None = None
     free: FloatArray | None = None
+    alternatives: Mapping[tuple[int, int], tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict
+    )
 
     @property
     def touches(self) -> bool:
@@ -99,14 +105,19 @@ class Iterate:
 
     def shifted(self, model: Model) -> "Iterate":
         """Return the iterate one step later: the last input is held, its end state appended."""
-        last = model.step(self.states[-1], self.inputs[-1])
+        last, N = model.step(self.states[-1], self.inputs[-1]), len(self.inputs)
+        alternatives = {
+            key: (_shifted(bounds, 0), _shifted(obstacles, 1, N))
+            for key, (bounds, obstacles) in self.alternatives.items()
+        }
         return Iterate(
             np.concatenate([self.states[1:], last[None]]),
             _shifted(self.inputs, 0),
             self.s,
-            _shifted(self.slack, 1, len(self.inputs)),
+            _shifted(self.slack, 1, N),
             None if self.multipliers is None else self.multipliers.shifted(),
             None if self.free is None else _shifted(self.free, 0),
+            alternatives,
         )
 
 
@@ -145,7 +156,7 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
             _check(guess.multipliers, {"states": (N, len(problem.bounded_states))})
         if guess.multipliers.rates.size:
             _check(guess.multipliers, {"rates": (N, model.nu)})
-    return guess
+    return replace(guess, alternatives={})  # what a caller cannot see does not count
 
 
 def _check(owner: Iterate | Multipliers, shapes: dict[str, tuple[int, ...]]) -> None:

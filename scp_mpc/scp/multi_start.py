@@ -1,10 +1,13 @@
 """Multi-start: other ways past the obstacles against the plan that is there.
 
-All ways are ranked by one program each, solved to its active set or cut off where the multipliers
-prove that it cannot win; the best are followed to their end, and win if they are better by enough.
-Where the plan needs slack, all are followed until one does not.
+All ways are ranked by the programs that linearise about them. The multipliers that OSQP has after a
+few iterations bound the program's optimum from below, and tightly: most ways are cut off by that,
+and many by the multipliers that the same way had one control step before, without any iteration.
+The best are followed to their end, and win if they are better by enough. Where the plan needs
+slack, all are followed until one does not.
 """
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from math import inf
 
@@ -20,11 +23,12 @@ from scp_mpc.scp.candidates import (
     varied,
 )
 from scp_mpc.scp.certificate import Nominal
-from scp_mpc.scp.iterate import NEGLIGIBLE
+from scp_mpc.scp.condensing import Condensed
+from scp_mpc.scp.iterate import NEGLIGIBLE, Iterate
 from scp_mpc.scp.loop import Loop
-from scp_mpc.scp.pairs import Pairs
+from scp_mpc.scp.pairs import Pairs, Planes
 from scp_mpc.scp.plan import Candidate, Result
-from scp_mpc.scp.transcription import Program, Relaxation, Transcription
+from scp_mpc.scp.transcription import Relaxation, Transcription
 
 # A rival must be better by this share, or the plan flickers between ways of equal cost.
 _HYSTERESIS = 0.001
@@ -44,12 +48,14 @@ class Ranked:
         passing: Its positions, and who pushes it where.
         about: (ny,) the path, where its half-spaces are taken.
         start: The plan that it seems to lead to, with its multipliers; None if it cannot win.
+        duals: Its multipliers (N, nu) of the input bounds and (M, C) of the obstacles.
     """
 
     merit: float
     passing: Passing
     about: FloatArray
     start: Nominal | None
+    duals: tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,36 +90,42 @@ class MultiStart:
         clear = float(best.iterate.slack.max(initial=0.0)) <= self._settings.tolerance
         return not clear or ((due or not best.status.ok) and best.iterate.touches)
 
-    def run(self, best: Result, free: FloatArray, fresh: bool = False) -> Found:
+    def run(self, best: Result, free: FloatArray, last: Iterate | None = None) -> Found:
         """Rank the ways past the obstacles by one program each; follow the best of them.
 
-        Among polytopes, a plan that is not `fresh` was searched for at the steps before: there are
-        no more candidates than elsewhere.
+        Among polytopes the search is thorough where there is no plan from the step before, or where
+        the one that is there is not safe.
 
         Args:
             best: The plan that is there.
             free: (C, d) positions of the plan that ignores the obstacles.
-            fresh: Whether there was none before.
+            last: The nominal plan of the step, or None.
         """
         at, step, clock = self._at, self._at.step, self._at.clock
         assert best.nominal is not None
         safe = best.status.ok
-        thorough = step.shapes is not None and (fresh or not safe)
-        most = clock.room(
-            "candidate", MOST_AMONG_WALLS if thorough else MAX_CANDIDATES, then="iteration"
-        )
+        thorough = step.shapes is not None and (last is None or not safe)
+        most = MOST_AMONG_WALLS if thorough else MAX_CANDIDATES
+        most = clock.room("candidate", most, then="iteration")
         if not most:
             return Found(best)
         began = clock.elapsed()
         here = Passing(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
-        ways = candidates(step, free, here.path, full, most)
-        ranked = self._rank(best, free, [way.path for way in ways], thorough)
+        ways, numbers = candidates(step, free, here.path, full, most), Counter[int]()
+        keys = []
+        for way in ways:  # an obstacle's ways come in the same order in each step
+            numbers[way.obstacle] += 1
+            keys.append((way.obstacle, numbers[way.obstacle]))
+        known = {} if last is None else last.alternatives
+        old = [known.get(key) for key in keys]
+        ranked = self._rank(best, free, [way.path for way in ways], old, thorough)
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
             Candidate(way.obstacle, way.normal, way.time, one.merit)
             for way, one in zip(ways, ranked, strict=False)  # fewer where time ran out
         )
+        duals = {key: one.duals for key, one in zip(keys, ranked, strict=False)}
         follow = self._settings.max_candidates
         if thorough:
             ranked = self._searched(best, free, ranked, full)
@@ -135,15 +147,20 @@ class MultiStart:
             rival = self._loop.run(first.start, goal, first.about)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
-        return Found(goal, tried, switched)
+        kept = replace(goal.iterate, alternatives=duals)
+        return Found(replace(goal, iterate=kept), tried, switched)
 
     def _rank(
-        self, best: Result, free: FloatArray, paths: list[FloatArray], thorough: bool
+        self,
+        best: Result,
+        free: FloatArray,
+        paths: list[FloatArray],
+        known: list[tuple[FloatArray, FloatArray] | None],
+        thorough: bool,
     ) -> list[Ranked]:
         """Look at one program about each path (C, d), all linearised at once, until the deadline.
 
-        A thorough look solves it; else the multipliers after a few iterations have to do, which
-        bound its optimum from below.
+        A thorough look solves it; else the multipliers after a few iterations have to do.
         """
         at, c, plan = self._at, self._at.layout, best.nominal
         if not paths or plan is None:
@@ -159,55 +176,65 @@ class MultiStart:
         condensed = at.linearise(present)
         give = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
         limit, found = _HOPELESS * best.merit if best.status.ok else inf, list[Ranked]()
-        for path, about, planes in zip(paths, ys, pairs.about(ys), strict=True):
+        for path, about, planes, duals in zip(paths, ys, pairs.about(ys), known, strict=True):
             if not at.clock.allows("candidate"):
                 break
-            program = at.write(present, condensed, planes, give)
-            one = self._look(program, present, path, about, limit, thorough)
-            found.append(one)
+            one = self._look(present, condensed, planes, give, duals, limit, thorough)
+            passing = one.passing if one.start is not None else Passing(path, one.passing.touched)
+            found.append(replace(one, about=about, passing=passing))
             if best.status.ok and not thorough and self._settings.max_candidates == 1:
                 limit = min(limit, one.merit)
         return found
 
     def _look(
         self,
-        program: Program,
         present: Nominal,
-        path: FloatArray,
-        about: FloatArray,
+        condensed: Condensed,
+        planes: Planes,
+        give: Relaxation,
+        known: tuple[FloatArray, FloatArray] | None,
         limit: float,
         thorough: bool,
     ) -> Ranked:
-        at, qp, rows = self._at, program.qp, program.rows
-        subproblem, condensed = program.subproblem, program.condensed
-        start = at.start(program, present)
-        merit, (z, y) = subproblem.solver.rank(qp, rows, start, limit)
+        """Look at the program with some planes, from the plan that is there."""
+        at, c, pairs = self._at, self._at.layout, present.pairs
+        hopeless = Passing(planes.y, np.zeros(pairs.near.shape, dtype=np.bool_))
+        qp = at.condensed_qp(condensed, pairs, planes, give)
+        nf = len(qp.F)
+        if known is not None and limit < inf:
+            force = np.zeros(nf + len(pairs.node))
+            force[:nf][c.inputs] = known[0].ravel()
+            force[nf:] = known[1][pairs.obstacle, pairs.node]
+            if qp.dual_bound(force) > limit:
+                at.firm.solver.finished["cut"] += 1
+                return Ranked(inf, hopeless, planes.y, None, known)
+        program = at.write(present, condensed, planes, give, qp=qp)
+        solver, start = program.subproblem.solver, at.start(program, present)
+        merit, (z, y) = solver.rank(qp, program.rows, start, limit)
+        force = program.rows.forces(y)
         exact = None
         if thorough and merit < inf:
-            exact = subproblem.solver.solve(qp, rows, (z, y))
+            exact = solver.solve(qp, program.rows, (z, y))
             merit = inf if exact is None else qp.merit(exact.v)
         at.clock.charge("solve")
+        pushes = np.zeros((at.problem.max_obstacles, at.nodes.size))
+        pushes[pairs.obstacle, pairs.node] = force[nf:]
+        duals = force[:nf][c.inputs].reshape(c.shape), pushes
         if merit == inf:
-            nobody = np.zeros(program.pairs.near.shape, dtype=np.bool_)
-            return Ranked(inf, Passing(path, nobody), about, None)
-        if exact is not None:
-            v, force = exact.v, exact.force
+            return Ranked(inf, hopeless, planes.y, None, duals)
+        if exact is None:
+            away = program.subproblem.box(z) - condensed.y_free[c.boxed][: len(qp.unbox)]
+            v = qp.unbox @ away
         else:
-            free = condensed.y_free[at.layout.boxed][: len(qp.unbox)]
-            v, force = qp.unbox @ (subproblem.box(z) - free), rows.forces(y)
+            v, force = exact.v, exact.force
         reached = condensed.y(v)
-        nf = len(qp.F)
-        push = program.pairs.table(force[nf:]) > NEGLIGIBLE
-        y, rollout = at.rolled(reached[at.layout.u].reshape(at.layout.shape), reached[at.layout.s])
-        seen = at.nominal(y, rollout, force[:nf], program.pairs, force[nf:])
-        return Ranked(merit, Passing(at.path(reached)[1:], push), about, seen)
+        passing = Passing(at.path(reached)[1:], pairs.table(force[nf:]) > NEGLIGIBLE)
+        y, rollout = at.rolled(reached[c.u].reshape(c.shape), reached[c.s])
+        plan = at.nominal(y, rollout, force[:nf], pairs, force[nf:])
+        return Ranked(merit, passing, planes.y, plan, duals)
 
     def _searched(
-        self,
-        best: Result,
-        free: FloatArray,
-        ranked: list[Ranked],
-        full: FloatArray,
+        self, best: Result, free: FloatArray, ranked: list[Ranked], full: FloatArray
     ) -> list[Ranked]:
         """Among polytopes, which face to pass at which stage is a search: the best few ways of all.
 
@@ -227,7 +254,7 @@ class MultiStart:
             if not paths or not most:
                 break
             began = clock.elapsed()
-            more = self._rank(best, free, paths[:most], True)
+            more = self._rank(best, free, paths[:most], [None] * len(paths[:most]), True)
             clock.learn("candidate", began, len(more))
             beam = _best([*beam, *more])
         return beam or ranked

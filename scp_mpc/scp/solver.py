@@ -243,7 +243,7 @@ class SCP:
             best = self._loop.run(at.at(start, about=about), about=about) if step.count else None
             found = Found(best or self._fallback.best(wide, last))
             if self._multi_start.wanted(found.best, multi_start):
-                found = self._multi_start.run(found.best, at.path(free.y)[1:], last is None)
+                found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
             if isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
             ending = clock.elapsed()

@@ -218,6 +218,7 @@ class Transcription:
         planes: Planes,
         give: Relaxation = Relaxation.NOBODY,
         radius: FloatArray | None = None,
+        qp: CondensedQP | None = None,
     ) -> Program:
         """Write the convex program about a plan: its values, condensed and sparse.
 
@@ -227,9 +228,11 @@ class Transcription:
             planes: Half-spaces of its pairs.
             give: Who may give way.
             radius: (N nu,) by how much inputs may change at most, or None.
+            qp: Its condensed values, if they are known.
         """
         pairs, along = nominal.pairs, condensed.about.along
-        qp = self._condensed_qp(condensed, pairs, planes, give, radius)
+        if qp is None:
+            qp = self.condensed_qp(condensed, pairs, planes, give, radius)
         subproblem = self.firm if give is Relaxation.NOBODY else self.elastic
         if subproblem.about is None or not (self.linear or subproblem.about is condensed.about):
             subproblem.write_dynamics(condensed.about)
@@ -240,7 +243,7 @@ class Transcription:
         self.clock.charge("update")
         return Program(condensed, pairs, planes, give, qp, subproblem, rows)
 
-    def _condensed_qp(
+    def condensed_qp(
         self,
         condensed: Condensed,
         pairs: Pairs,
@@ -248,6 +251,7 @@ class Transcription:
         give: Relaxation = Relaxation.NOBODY,
         radius: FloatArray | None = None,
     ) -> CondensedQP:
+        """The condensed values of a convex program; arguments as for `write`."""
         c, by = self.layout, condensed.by
         A = np.einsum("kw,kwn->kn", planes.a, pairs.rows(by.S))
         b = (planes.a * (planes.y - condensed.y_free)[pairs.at]).sum(axis=1) - planes.g
@@ -347,7 +351,7 @@ class Transcription:
     def second_order(self, plan: Nominal) -> tuple[Nominal, FloatArray]:
         """A plan with its least curvature known, and the direction (N, nu) of it in inputs."""
         condensed = self.condenser.condensed(plan.rollout, plan.y[self.layout.s])
-        qp, v = self._condensed_qp(condensed, plan.pairs, plan.planes), condensed.here
+        qp, v = self.condensed_qp(condensed, plan.pairs, plan.planes), condensed.here
         nf, nowhere = len(qp.F), Rows(np.zeros(0, dtype=np.intp))
         program = Program(
             condensed, plan.pairs, plan.planes, Relaxation.NOBODY, qp, self.firm, nowhere
