@@ -34,8 +34,8 @@ from scp_mpc.scp.trust_region import Region
 
 _PATIENCE = 3  # iterations before a rival is given up
 _FAR = 1.1  # share of the goal's merit above which it is
-_SURPLUS = 1e-3  # of the tolerance: worth one more iteration, whose convergence is quadratic
-_SURPLUS_NONLINEAR = 0.1  # the same where an iteration costs ten times as much
+_LEAST_COST = 1e-3  # relative to which products of forces and gaps are judged
+_SURPLUS = 0.1  # of the tolerance: worth one more iteration, whose convergence is quadratic
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 
 
@@ -118,8 +118,9 @@ class Loop:
             nominal, best, planes, worst = trial, trial, trial.planes, trial.residuals.worst
             if not (trial.slack.any() or trial.excess.any()):
                 give = Relaxation.NOBODY
-            surplus = (_SURPLUS if at.linear else _SURPLUS_NONLINEAR) if before > tolerance else 1.0
-            if worst <= surplus * tolerance:
+            enough = tolerance if before <= tolerance else _SURPLUS * tolerance
+            product = trial.residuals.complementarity / min(1.0, max(trial.cost, _LEAST_COST))
+            if max(worst, product) <= enough:
                 best, direction = at.second_order(trial)
                 away = None
                 if best.residuals.curvature < -BENT:  # a saddle is not an end, but a way down
