@@ -72,7 +72,7 @@ class Loop:
         at, clock, tolerance = self._at, self._at.clock, self._settings.tolerance
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
         region, give, history = Region(at), Relaxation.NOBODY, list[Record]()
-        best, leaps, bold, iterations = None, 0, about is None, 0
+        best, leaps, bold, iterations = None, 0, True, 0
         limit = self._settings.max_iterations if limit is None else limit
         while iterations < limit and clock.allows("iteration"):
             began = clock.elapsed()
