@@ -14,6 +14,7 @@ from rebuilt import slopes
 from solving import half_spaces
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status, Trajectory
+from scp_mpc.qp.active_set import QPSolution
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp import transcription
 from scp_mpc.scp.certificate import least_curvature
@@ -305,7 +306,12 @@ def test_the_second_derivative_is_that_of_the_rolled_out_cost(name):
     at = Transcription(case, Settings(), Nodes.of(case))
     at.begin(Step.read(case, x0, x_ref, [], nodes=at.nodes), Clock())
     U = case.limited(model.idle + 0.2 * rng.normal(size=(N, model.nu)))
-    least = at.second_order(at.plain(U))[0].residuals.curvature
+    plan = at.plain(U)
+    program = at.write(plan, at.linearise(plan), plan.planes)
+    here, nothing = program.condensed.here, np.zeros(len(program.qp.F), dtype=np.intp)
+    none = np.zeros((0, 0))
+    there = QPSolution(here, 0.0 * nothing, nothing, nothing > 0, none, nothing[:0], none)
+    least = at.second_order(plan, program, there)[0].residuals.curvature
 
     def errors(u):
         return (rollout(model.step, x0, u.reshape(N, -1)).states - x_ref)[1:].ravel()

@@ -13,6 +13,7 @@ from scp_mpc import (
     ObstaclePrediction,
     Settings,
     Status,
+    Trajectory,
 )
 
 SETTINGS = Settings(multi_start=False, max_iterations=100)
@@ -45,7 +46,13 @@ def test_a_linear_robot_given_as_a_function_gets_the_same_plan(changes, s_min):
     ref = straight_reference(20)
     obstacles = [obstacle(20, (3.0, 0.15)), obstacle(20, (5.0, -0.6), (-0.3, 0.1))]
     x0 = ref[0] + [0.0, 0.1, 0.1, 0.2]
-    plans = [SCP(p, SETTINGS).solve(x0, ref, obstacles, u_last=[0.1, 0.0]) for p in (linear, other)]
+    # Both from a path on the same side: there are several, and the two search in different ways.
+    path = SCP(linear, SETTINGS).solve(x0, ref, obstacles, u_last=[0.1, 0.0])
+    guess = Trajectory(path.X, 0.5 * path.U)
+    plans = [
+        SCP(p, SETTINGS).solve(x0, ref, obstacles, guess, u_last=[0.1, 0.0])
+        for p in (linear, other)
+    ]
     for plan in plans:
         assert plan.status is Status.CONVERGED
         assert plan.iterate.touches

@@ -115,6 +115,17 @@ class CondensedQP:
         best = np.maximum(pull * self.lower[:n], pull * self.upper[:n]).sum()
         return bool(asked > best + _ACCURACY * np.abs(force).sum())
 
+    def violations(self, v: FloatArray) -> tuple[FloatArray, IntArray]:
+        """How far constraints (nf + K,) are violated, negative if they hold; and at which side."""
+        nf, values = len(self.F), self.rows @ v
+        bounded = values[:nf]
+        below, above = self.lower - bounded, bounded - self.upper
+        depth, side = np.empty(len(values)), np.full(len(values), -1, dtype=np.intp)
+        np.maximum(below, above, out=depth[:nf])
+        depth[nf:] = self.b - values[nf:]
+        side[:nf][above > below] = 1
+        return depth, side
+
     def _admissible(self, force: FloatArray) -> FloatArray:
         """Forces without those that have no bound to push at."""
         nf, force = len(self.F), force.copy()
@@ -194,7 +205,7 @@ def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -
     """Whether all forces push the right way, and all constraints that do not yield hold."""
     if (solution.force * solution.active).max(initial=0.0) > 0.0:
         return False
-    depth = _violations(qp, solution.v)[0]
+    depth = qp.violations(solution.v)[0]
     return bool(np.where(solution.capped, 0.0, depth).max(initial=0.0) <= tolerance)
 
 
@@ -256,7 +267,7 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
     force, v = np.abs(solution.force), solution.v.copy()
     cap = np.full(len(force), np.inf) if qp.cap is None else qp.cap
     while True:
-        depth, side = _violations(qp, v)
+        depth, side = qp.violations(v)
         depth = np.where(capped, -depth, np.where(active != 0, 0.0, depth))
         p = int(depth.argmax())
         if depth[p] <= _ACCURACY:
@@ -267,7 +278,9 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
                 solution = replace(solution, force=np.where(wrong > 0, 0.0, solution.force))
                 if wrong.max() > _PULL * np.abs(solution.force).max(initial=1.0):
                     return Settled(None, systems)
-            return Settled(solution if holds(qp, solution, _HELD) else None, systems)
+            if systems > 1 and not holds(qp, solution, _HELD):
+                return Settled(None, systems)
+            return Settled(solution, systems)
         yields = capped[p]  # and its force is to fall, for there is room
         if not yields:
             active[p] = side[p]
@@ -322,18 +335,6 @@ def _gap(qp: CondensedQP, v: FloatArray, p: int, side: int, yields: bool) -> flo
     bound = qp.b[p - nf] if p >= nf else (qp.lower[p] if side < 0 else qp.upper[p])
     lacks = (bound - value) * -side
     return -lacks if yields else lacks
-
-
-def _violations(qp: CondensedQP, v: FloatArray) -> tuple[FloatArray, IntArray]:
-    """By how much constraints (nf + K,) are violated, negative if they hold; and at which side."""
-    nf, values = len(qp.F), qp.rows @ v
-    bounded = values[:nf]
-    below, above = qp.lower - bounded, bounded - qp.upper
-    depth, side = np.empty(len(values)), np.full(len(values), -1, dtype=np.intp)
-    np.maximum(below, above, out=depth[:nf])
-    depth[nf:] = qp.b - values[nf:]
-    side[:nf][above > below] = 1
-    return depth, side
 
 
 def _ill_conditioned(factor: FloatArray) -> bool:

@@ -21,7 +21,6 @@ Notation:
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
@@ -33,7 +32,7 @@ from scp_mpc.scp.pairs import Pairs, Planes
 _NOTHING = np.zeros(0)
 _STRONG = 1e-6  # force, relative to the largest, from which a constraint is strongly active
 _TOUCH = 1e-7  # distance to a constraint that is none
-_DEPENDENT = 1e-9  # of the largest pivot: none
+_DEPENDENT = 1e-12  # of the largest eigenvalue of rows rows': none
 _LEAST = 1e-300
 BENT = 1e-6  # of the largest curvature: what is less is taken for flat
 
@@ -226,9 +225,9 @@ def _smallest(
     nv = bends.shape[1]
     basis = None
     if len(rows):  # orthonormal rows that span theirs
-        Q, R, _ = qr(rows.T, mode="economic", pivoting=True)
-        size = np.abs(R.diagonal())
-        basis = Q[:, size > _DEPENDENT * size[0]]
+        sizes, vectors = np.linalg.eigh(rows @ rows.T)
+        kept = sizes > _DEPENDENT * sizes[-1]
+        basis = (rows.T @ vectors[:, kept]) / np.sqrt(sizes[kept])
         if basis.shape[1] == nv:  # nothing is left to move in
             return 1.0, np.zeros(nv)
     if W is None:  # the eigenvalues of I - L'L on a subspace are those of a matrix as small as L

@@ -121,7 +121,7 @@ class Loop:
             enough = tolerance if before <= tolerance else _SURPLUS * tolerance
             product = trial.residuals.complementarity / min(1.0, max(trial.cost, _LEAST_COST))
             if max(worst, product) <= enough:
-                best, direction = at.second_order(trial)
+                best, direction = at.second_order(trial, program, refinement)
                 away = None
                 if best.residuals.curvature < -BENT:  # a saddle is not an end, but a way down
                     away = downhill(at, trial, direction)

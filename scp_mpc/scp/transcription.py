@@ -348,28 +348,26 @@ class Transcription:
         stages, sway = self.nodes.curvature(states, about.inputs, -nu, -on_p)
         return self._condensed_curvature(condensed, stages, sway)
 
-    def second_order(self, plan: Nominal) -> tuple[Nominal, FloatArray]:
-        """A plan with its least curvature known, and the direction (N, nu) of it in inputs."""
-        condensed = self.condenser.condensed(plan.rollout, plan.y[self.layout.s])
-        qp, v = self.condensed_qp(condensed, plan.pairs, plan.planes), condensed.here
-        nf, nowhere = len(qp.F), Rows(np.zeros(0, dtype=np.intp))
-        program = Program(
-            condensed, plan.pairs, plan.planes, Relaxation.NOBODY, qp, self.firm, nowhere
-        )
-        force = np.concatenate([plan.reaction, plan.force])
-        bounded = qp.F @ v
-        below, above = bounded - qp.lower, qp.upper - bounded
-        room = np.concatenate([np.minimum(below, above), qp.A @ v - qp.b])
-        active = (room <= _TOUCH) | (np.abs(force) > NEGLIGIBLE)
-        active[nf:] &= plan.slack <= 0
-        at = active.nonzero()[0]
-        nearer = np.append(below <= above, np.ones(len(room) - nf, dtype=np.bool_))
-        sign = np.where(force == 0, np.where(nearer, 1, -1), np.sign(force))
-        rows, none = qp.rows[at] * sign[at, None], np.zeros((0, 0))
-        solution = QPSolution(v, force, at, active, none, at, none)
-        W, bends = self._dynamics_curvature(program, solution), self.bends(program, force[nf:])[0]
-        least, direction = least_curvature(W, bends, rows, np.abs(force[at]))
-        inputs = condensed.by.inverse.T @ direction[: len(condensed.by.inverse)]
+    def second_order(
+        self, plan: Nominal, program: Program, solution: QPSolution
+    ) -> tuple[Nominal, FloatArray]:
+        """A plan with its least curvature known, and the direction (N, nu) of it in inputs.
+
+        Args:
+            plan: The plan.
+            program: The program that led to it; at a KKT point the two agree to first order.
+            solution: Its solution, which knows the active set.
+        """
+        qp, by, nf = program.qp, program.condensed.by, len(program.qp.F)
+        depth, side = qp.violations(solution.v)
+        touched = (depth >= -_TOUCH) & (solution.active == 0)  # without a force: weakly active
+        indices = np.concatenate([solution.indices, touched.nonzero()[0]])
+        towards = -np.where(touched, side, solution.active)[indices]  # where they allow to go
+        W = self._dynamics_curvature(program, solution)
+        bends = self.bends(program, solution.force[nf:])[0]
+        rows, force = qp.rows[indices] * towards[:, None], np.abs(solution.force[indices])
+        least, direction = least_curvature(W, bends, rows, force)
+        inputs = by.inverse.T @ direction[: len(by.inverse)]
         residuals = replace(plan.residuals, curvature=least)
         return replace(plan, residuals=residuals), inputs.reshape(self.layout.shape)
 
