@@ -19,8 +19,7 @@ from scp_mpc import (
 )
 from scp_mpc.qp.osqp import OSQP
 from scp_mpc.scp import KKTResiduals, loop
-from scp_mpc.scp.loop import judge
-from scp_mpc.scp.plan import Result
+from scp_mpc.scp.plan import Result, judge
 from scp_mpc.scp.trust_region import Region
 
 KEEP_SIDE = Settings(multi_start=False)

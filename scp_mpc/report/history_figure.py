@@ -26,7 +26,8 @@ from scp_mpc.report.canvas import (
 )
 from scp_mpc.report.outline import outline
 from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.scp.plan import Plan, Record
+from scp_mpc.scp.history import Record
+from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 
 _OUTLINES = 4  # of one obstacle at most

@@ -6,9 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.program import KKTResiduals
-from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.certificate import BENT, Nominal
+from scp_mpc.scp.history import Record
 from scp_mpc.scp.iterate import Iterate, Multipliers
 from scp_mpc.scp.step import Step
 
@@ -65,37 +66,6 @@ class Candidate:
     side: FloatArray
     time: float
     merit: float
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """One SCP iteration.
-
-    Attributes:
-        cost: Of the plan it led to.
-        violation: Largest violation of an obstacle's constraint there [m].
-        residual: Largest KKT residual of the original problem there.
-        step: Norm of what the inputs changed by.
-        accepted: Whether that plan became the next nominal.
-        iterations: ADMM iterations that OSQP took to name the active set; 0 of other solvers.
-        positions: (C+1, d) of the plan, from now on [m].
-        obstacles: (k,) which obstacles push the convex program's solution.
-        normals: (k, d) their half-spaces' normals: n'(p - point) >= -value holds.
-        points: (k, d) about which these were taken [m].
-        values: (k,) of the constraint functions there [m].
-    """
-
-    cost: float
-    violation: float
-    residual: float
-    step: float
-    accepted: bool
-    iterations: int
-    positions: FloatArray
-    obstacles: IntArray
-    normals: FloatArray
-    points: FloatArray
-    values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +192,12 @@ class Result:
         if not self.status.ok and self.status.certified != other.status.certified:
             return self.status.certified
         return self.merit < other.merit - lead
+
+
+def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
+    """Return the status of a plan with the given residuals and largest slack."""
+    inside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
+    certified = residuals.worst <= tolerance and slack == slack
+    if certified and not residuals.curvature < -BENT:
+        return Status.SOFTENED if inside else Status.CONVERGED
+    return Status.VIOLATING if inside else Status.FEASIBLE
