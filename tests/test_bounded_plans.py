@@ -13,7 +13,7 @@ from rebuilt import couplings_of, rebuilt
 from scp_mpc import MPC, SCP, Settings, Status
 from scp_mpc.comparison.audit import audit
 from scp_mpc.comparison.violation import largest_violation
-from scp_mpc.scp.deadline import Clock
+from scp_mpc.deadline import Clock
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Transcription

@@ -14,11 +14,11 @@ from rebuilt import slopes
 from solving import half_spaces
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status, Trajectory
+from scp_mpc.deadline import Clock
 from scp_mpc.qp.active_set import QPSolution
 from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp import transcription
 from scp_mpc.scp.certificate import least_curvature
-from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.pairs import Pairs

@@ -19,8 +19,8 @@ from scp_mpc import (
     Status,
     Trajectory,
 )
+from scp_mpc.deadline import Clock, Pace
 from scp_mpc.qp.backend import ProgramSolver
-from scp_mpc.scp.deadline import Clock, Pace
 
 
 def test_each_status_has_a_sentence_and_knows_whether_it_is_safe():

@@ -15,12 +15,12 @@ from scp_mpc import (
     Status,
     Trajectory,
 )
+from scp_mpc.deadline import Clock
 from scp_mpc.qp.active_set import CondensedQP, settled
 from scp_mpc.safety import NoGoSets
 from scp_mpc.safety.inflation import AxesInflation, ExactInflation
 from scp_mpc.safety.tangents import inverse_root, tangents
 from scp_mpc.scp import loop
-from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.loop import Loop
 from scp_mpc.scp.newton import newton_step, summed
 from scp_mpc.scp.nodes import Nodes

@@ -10,9 +10,9 @@ from rebuilt import SLOTS, couplings_of, rebuilt
 from solving import solution
 
 from scp_mpc import SCP, DoubleIntegrator, Margin, ObstaclePrediction, Settings, Status, Trajectory
+from scp_mpc.deadline import Clock
 from scp_mpc.obstacles import Polytope
 from scp_mpc.qp.sparse_blocks import SparseBlocks
-from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.pairs import Pairs
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Relaxation, Transcription

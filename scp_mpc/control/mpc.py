@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.memory import ObstacleMemory, Recall
+from scp_mpc.deadline import Clock
 from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import ROUNDING, Problem
-from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP

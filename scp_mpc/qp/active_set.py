@@ -217,11 +217,13 @@ class Settled:
         solution: The program's; None if it was not reached.
         systems: Linear systems solved on the way: 1 if the guess was right.
         infeasible: Whether there is no solution, for certain.
+        late: Whether there was no time to go on.
     """
 
     solution: QPSolution | None
     systems: int
     infeasible: bool = False
+    late: bool = False
 
 
 def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) -> Settled:

@@ -11,14 +11,16 @@ and checks every constraint and every force.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.deadline import Clock
 from scp_mpc.errors import InvalidArgumentError
-from scp_mpc.qp.active_set import CondensedQP, QPSolution, settled
+from scp_mpc.qp.active_set import CondensedQP, Settled, settled
 from scp_mpc.qp.osqp import OSQP
 from scp_mpc.qp.others import PIQP, Named, installed, known
 from scp_mpc.qp.program import Backend, QuadraticProgram
@@ -98,40 +100,39 @@ class ProgramSolver:
         qp: CondensedQP,
         rows: Rows,
         start: tuple[FloatArray, FloatArray],
-        rescue: bool = True,
-    ) -> QPSolution | None:
-        """Return the program's solution; None where there is none, or nobody found it.
+        clock: Clock,
+    ) -> Settled:
+        """Return the program's solution, or that there is none, or that nobody found it in time.
 
         Args:
             qp: The condensed program; the sparse one has been written.
             rows: Which row is which.
             start: x (n,) and y (m,) to start from.
-            rescue: Whether there is time for PIQP.
+            clock: Whether there is time for more than the first run.
         """
-        self.backend.load(start)
-        for effort, repairs in self.backend.stages:
-            point = _run(self.backend, effort)
-            self.iterations = getattr(self.backend, "iterations", 0)
-            if point is None:
-                break
-            end = settled(qp, *rows.active(point[1], self.backend.noise), repairs)
+        solver, end = self.backend, Settled(None, 0)
+        solver.load(start)
+        for k, stage in enumerate(solver.stages):
+            if k and not clock.allows("longer run"):
+                return replace(end, late=True)
+            with clock.task("longer run") if k else nullcontext():
+                end = _attempt(solver, qp, rows, *stage, clock)
+            self.iterations = getattr(solver, "iterations", 0)
             if end.solution is not None:
-                direct = end.systems <= _DIRECT
-                self.finished[self.backend.name if direct else "repaired"] += 1
-                return end.solution
-            if end.infeasible or qp.proves_infeasible(rows.forces(point[1])):
+                self.finished[solver.name if end.systems <= _DIRECT else "repaired"] += 1
+                return end
+            if end.infeasible:
                 self.finished["infeasible"] += 1
-                return None
-        if not rescue or self._rescue is None:
-            return None
-        self._rescue.load(start)
-        point = _run(self._rescue, 1)
-        if point is None:
-            return None
-        (_, repairs), noise = self._rescue.stages[0], self._rescue.noise
-        end = settled(qp, *rows.active(point[1], noise), repairs)
+                return end
+        if self._rescue is None:
+            return end
+        if not clock.allows("rescue"):
+            return replace(end, late=True)
+        with clock.task("rescue"):
+            self._rescue.load(start)
+            end = _attempt(self._rescue, qp, rows, *self._rescue.stages[0], clock)
         self.finished["piqp"] += end.solution is not None
-        return end.solution
+        return end
 
     def rank(
         self, qp: CondensedQP, rows: Rows, start: tuple[FloatArray, FloatArray], limit: float
@@ -161,6 +162,21 @@ class ProgramSolver:
                 break
         self.finished["cut" if bound == inf else "ranked"] += 1
         return bound, start
+
+
+def _attempt(
+    solver: Backend, qp: CondensedQP, rows: Rows, effort: int, repairs: int, clock: Clock
+) -> Settled:
+    """Let a solver go on, and see whether what it names leads to the solution, or proves none."""
+    point = _run(solver, effort)
+    if point is None:
+        return Settled(None, 0)
+    most, began = clock.room("repair", repairs), clock.elapsed()
+    end = settled(qp, *rows.active(point[1], solver.noise), most)
+    clock.learn("repair", began, end.systems)
+    if end.solution is None and qp.proves_infeasible(rows.forces(point[1])):
+        return replace(end, infeasible=True)
+    return end
 
 
 def _run(solver: Backend, effort: int) -> tuple[FloatArray, FloatArray] | None:

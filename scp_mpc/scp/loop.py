@@ -70,23 +70,26 @@ class Loop:
         best: Nominal | None = None
         limit = self._settings.max_iterations if limit is None else limit
         while iterations < limit and clock.allows("iteration"):
-            began = clock.elapsed()
-            condensed = at.linearise(nominal)
-            program = at.write(nominal, condensed, planes, give, region.radius)
-            solution = at.solve(program, nominal)
-            clock.learn("iteration", began)
+            with clock.task("iteration"):
+                condensed = at.linearise(nominal)
+                program = at.write(nominal, condensed, planes, give, region.radius)
+                end = at.solve(program, nominal)
+                solution = end.solution
+                if solution is not None:
+                    step, ahead = (
+                        refined(at, program, solution, leaps) if bold else (solution, None)
+                    )
+                    trial = at.certify(program, step)
             if solution is None:
                 if planes is not nominal.planes and best is not None:
                     planes, leaps, bold = nominal.planes, 0, False  # it was a leap too far
                     continue
                 more = at.next_relaxation(give, firm or not len(nominal.force))
-                if more is None:
+                if more is None or end.late:
                     break
                 give = more
                 continue
             iterations += 1
-            step, ahead = refined(at, program, solution, leaps) if bold else (solution, None)
-            trial = at.certify(program, step)
             left_out = at.screen(trial) if screen else None
             if left_out is not None:  # they enter, and the program is solved again
                 own, nominal = planes is nominal.planes, at.with_pairs(nominal, left_out)

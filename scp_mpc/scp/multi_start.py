@@ -214,7 +214,7 @@ class MultiStart:
         force = program.rows.forces(y)
         exact = None
         if thorough and merit < inf:
-            exact = solver.solve(qp, program.rows, (z, y))
+            exact = solver.solve(qp, program.rows, (z, y), at.clock).solution
             merit = inf if exact is None else qp.merit(exact.v)
         at.clock.charge("solve")
         pushes = np.zeros((at.problem.max_obstacles, at.nodes.size))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, frozen
+from scp_mpc.deadline import Clock, Pace
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -29,7 +30,6 @@ from scp_mpc.qp.program import QuadraticProgram
 from scp_mpc.safety.margin import JointRisk
 from scp_mpc.scp.allocate import allocate
 from scp_mpc.scp.certificate import Nominal
-from scp_mpc.scp.deadline import Clock, Pace
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.loop import Loop
@@ -232,15 +232,18 @@ class SCP:
         if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
             at.step = wide
             return self._plan(wide, Found(self._loop.result(free)), clock)
+        at.free = at.iterate(free)
         about = at.outputs(last) if path and last is not None else None
-        start = at.iterate(free) if last is None else last
+        start = at.free if last is None else last
         for _ in range(_CORRECTIONS):
             assumed = None
             if free_motion is not None:
                 assumed = self._motion(start).reserved(free_motion, self._nodes.most_deviation)
                 wide = self._widened(step, assumed)
             at.step = wide
-            best = self._loop.run(at.at(start, about=about), about=about) if step.count else None
+            best = None
+            if step.count and clock.allows("iteration"):
+                best = self._loop.run(at.at(start, about=about), about=about)
             found = Found(best or self._fallback.best(wide, last))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
@@ -260,35 +263,30 @@ class SCP:
     def _obstacle_free(self, last: Iterate | None) -> Nominal:
         """The plan that ignores the obstacles: no other costs less, and most steps need no more.
 
-        For a linear robot that is one linear system, or one program where bounds are in the way.
-        For a nonlinear one the loop finds it, from the better of the last plan and the last
-        obstacle-free one, for both lead to local optima only; where an obstacle shaped the last
-        plan, only the sides of the obstacles are sought, and one program about it has to do.
+        For a linear robot that takes a few linear systems. For a nonlinear one the loop finds it,
+        from the better of the last plan and the last obstacle-free one, for both lead to local
+        optima only; where an obstacle shaped the last plan, only the sides of the obstacles are
+        sought, and one program about it has to do.
         """
         at, limit = self._at, None
-        rest = np.tile(self.problem.model.idle, (self.problem.horizon, 1))
-        if at.linear:
-            s = np.full(self.problem.max_obstacles, self.problem.size.reference)
-            free = at.condenser.condensed(at.condenser.rolled(rest), s).y_free
-            start = at.plain(free[at.layout.u].reshape(rest.shape))
-            (lower, upper), box = at.bounds, at.layout.boxed
-            if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
-                at.firm.solver.finished["kkt"] += 1
-                return start
-            if last is not None and not last.touches:
-                start = at.at(last, at.nobody.near)
-        elif last is None:
-            start = at.plain(rest)
-        else:
-            start = at.plain(last.inputs, last.states[1:] - at.step.x_ref[1:])
-            limit = 1 if last.touches else None
-            if last.free is not None and not last.touches:
-                other = at.plain(last.free)
-                merits = [at.merit(p.cost, 0.0, p.excess) for p in (start, other)]
-                start = other if merits[1] < merits[0] else start
-        found = self._loop.run(start, limit=limit, screen=False)
-        plan = start if found is None or found.nominal is None else found.nominal
-        at.free = None if at.linear else plan.rollout.inputs
+        known = last if last is None or not last.touches else last.free
+        plan = at.unobstructed(known) if at.linear else None
+        if plan is None:
+            if last is None:
+                start = at.plain(np.tile(self.problem.model.idle, (self.problem.horizon, 1)))
+            elif at.linear:
+                start = at.at(known or last, at.nobody.near)
+            else:
+                start = at.plain(last.inputs, last.states[1:] - at.step.x_ref[1:])
+                limit = 1 if last.touches else None
+                if last.free is not None and not last.touches:
+                    other = at.at(last.free, at.nobody.near)
+                    merits = [at.merit(p.cost, 0.0, p.excess) for p in (start, other)]
+                    start = other if merits[1] < merits[0] else start
+            found = None
+            if last is None or not last.touches or at.clock.room("iteration", 2) == 2:
+                found = self._loop.run(start, limit=limit, screen=False)
+            plan = start if found is None or found.nominal is None else found.nominal
         return plan
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result) -> Result:

@@ -204,6 +204,13 @@ class Subproblem:
             spaces = y[self._spaces]
             pins[2 * states :] = -np.maximum(price + spaces, 0.0) * self._coupling[1]
             y[self._pins] = pins
+            values = self.program.A @ z
+            short, over = self.program.lower - values, values - self.program.upper
+            z[self._slack] = np.maximum(short[self._spaces], 0.0) / self._coupling[1]
+            if states:
+                held = slice(self._bounded.stop - states, self._bounded.stop)
+                z[self._below] = np.maximum(short[held], 0.0) / self._coupling[0]
+                z[self._above] = np.maximum(over[held], 0.0) / self._coupling[0]
         return z, y
 
     def box(self, z: FloatArray) -> FloatArray:

@@ -10,12 +10,12 @@ from enum import IntEnum
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
+from scp_mpc.deadline import Clock
 from scp_mpc.problem import Problem
-from scp_mpc.qp.active_set import CondensedQP, QPSolution
+from scp_mpc.qp.active_set import CondensedQP, QPSolution, Settled, settled
 from scp_mpc.qp.backend import Rows
 from scp_mpc.scp.certificate import Certificate, Nominal, least_curvature
 from scp_mpc.scp.condensing import Condensed, Condenser, Rollout
-from scp_mpc.scp.deadline import Clock
 from scp_mpc.scp.iterate import NEGLIGIBLE, Iterate, Multipliers
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes, NonlinearNodes
@@ -24,6 +24,7 @@ from scp_mpc.scp.step import Step
 from scp_mpc.scp.subproblem import Subproblem
 from scp_mpc.settings import Settings
 
+_REPAIRS = 10  # of the bounds of a plan that ignores the obstacles
 _TOUCH = 1e-7  # distance to a constraint that counts as none
 _ROUNDING = 1e-10  # of a bounded entry, in its own unit
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
@@ -74,12 +75,12 @@ class Transcription:
         linear: Whether the robot is linear.
         step: The control step, with radii and sizes as they count just now.
         nobody: No pairs at all.
-        free: (N, nu) inputs of the plan that ignores the obstacles; nonlinear robots' only.
+        free: The plan that ignores the obstacles, where another one was found.
     """
 
     step: Step
     nobody: Pairs
-    free: FloatArray | None
+    free: Iterate | None
 
     def __init__(self, problem: Problem, settings: Settings, nodes: Nodes) -> None:
         """Condense the problem, lay the programs out and set up their solvers."""
@@ -163,10 +164,36 @@ class Transcription:
         reaction = np.zeros(self.layout.size - self.layout.boxed.start)
         force = np.zeros(len(pairs.node))
         if duals is not None:
-            given = duals.margin, duals.inputs, duals.rates, duals.states
-            reaction = -self.layout.gathered(*given)
+            reaction = self._reaction(duals)
             force = -duals.obstacles[pairs.obstacle, pairs.node]
         return self.nominal(y, rollout, reaction, pairs, force)
+
+    def unobstructed(self, guess: Iterate | None) -> Nominal | None:
+        """A linear robot's plan that ignores the obstacles, from the bounds where another one is.
+
+        No more than a few linear systems: the program has only bounds, and few of them change from
+        step to step. None where that does not lead to it.
+        """
+        rest = np.tile(self.problem.model.idle, (self.problem.horizon, 1))
+        condensed = self.condenser.condensed(self.condenser.rolled(rest), self._full)
+        free, (lower, upper), box = condensed.y_free, self.bounds, self.layout.boxed
+        if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
+            self.firm.solver.finished["kkt"] += 1
+            return self.plain(free[self.layout.u].reshape(rest.shape))
+        planes = self.nobody.planes(free)
+        qp = self.condensed_qp(condensed, self.nobody, planes)
+        active = np.zeros(len(qp.F), dtype=np.intp)
+        if guess is not None and guess.multipliers is not None:
+            active[:] = -np.sign(self._reaction(guess.multipliers))
+        most, began = self.clock.room("repair", _REPAIRS, then="iteration"), self.clock.elapsed()
+        end = settled(qp, active, np.zeros(len(active), dtype=np.bool_), most)
+        self.clock.learn("repair", began, end.systems)
+        self.clock.charge("solve")
+        if end.solution is None:
+            return None
+        self.firm.solver.finished["kkt"] += 1
+        given = condensed, self.nobody, planes, Relaxation.NOBODY, qp, self.firm
+        return self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
 
     def outputs(self, iterate: Iterate) -> FloatArray:
         """Y (ny,) of an iterate's own states, which need not be where its inputs lead."""
@@ -277,13 +304,12 @@ class Transcription:
         given = plan.deviations, plan.inputs, nominal.y[self.layout.s], nominal.costates, force
         return program.subproblem.start(*given)
 
-    def solve(self, program: Program, nominal: Nominal) -> QPSolution | None:
-        """Solve a program from a plan and its multipliers; None if there is no solution."""
-        start, rescue = self.start(program, nominal), self.clock.allows("rescue")
-        solver = program.subproblem.solver
-        solution = solver.solve(program.qp, program.rows, start, rescue)
+    def solve(self, program: Program, nominal: Nominal) -> Settled:
+        """Solve a program from a plan and its multipliers."""
+        start, solver = self.start(program, nominal), program.subproblem.solver
+        end = solver.solve(program.qp, program.rows, start, self.clock)
         self.clock.charge("solve")
-        return solution
+        return end
 
     def next_relaxation(self, give: Relaxation, firm: bool) -> Relaxation | None:
         """Who is to give way next; None if nobody is left: firm obstacles never do."""
@@ -359,12 +385,15 @@ class Transcription:
             solution: Its solution, which knows the active set.
         """
         qp, by, nf = program.qp, program.condensed.by, len(program.qp.F)
+        W = self._dynamics_curvature(program, solution)
+        bends = self.bends(program, solution.force[nf:])[0]
+        if W is None and not len(bends):  # nothing but the convex program
+            residuals = replace(plan.residuals, curvature=1.0)
+            return replace(plan, residuals=residuals), np.zeros(self.layout.shape)
         depth, side = qp.violations(solution.v)
         touched = (depth >= -_TOUCH) & (solution.active == 0)  # without a force: weakly active
         indices = np.concatenate([solution.indices, touched.nonzero()[0]])
         towards = -np.where(touched, side, solution.active)[indices]  # where they allow to go
-        W = self._dynamics_curvature(program, solution)
-        bends = self.bends(program, solution.force[nf:])[0]
         rows, force = qp.rows[indices] * towards[:, None], np.abs(solution.force[indices])
         least, direction = least_curvature(W, bends, rows, force)
         inputs = by.inverse.T @ direction[: len(by.inverse)]
@@ -372,6 +401,12 @@ class Transcription:
         return replace(plan, residuals=residuals), inputs.reshape(self.layout.shape)
 
     # --- what is handed out
+
+    def _reaction(self, duals: Multipliers) -> FloatArray:
+        """Forces (nf,) of the bounds."""
+        given = duals.margin, duals.inputs, duals.rates, duals.states
+        reaction: FloatArray = -self.layout.gathered(*given)
+        return reaction
 
     def iterate(self, nominal: Nominal, cap: float = np.inf) -> Iterate:
         """Name the parts of a plan in the words of the problem; `cap` is the largest force."""

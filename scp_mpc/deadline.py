@@ -1,6 +1,8 @@
 """Where the time of one control step goes, and whether what comes next still fits in."""
 
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import inf
 from time import perf_counter
 
@@ -51,6 +53,7 @@ class Clock:
         self._pace = Pace() if pace is None else pace
         self.spent: defaultdict[str, float] = defaultdict(float)
         self._began = self._lap = perf_counter()
+        self._booked = 0.0  # [s] of tasks
 
     def elapsed(self) -> float:
         """Seconds since the step began."""
@@ -72,7 +75,7 @@ class Clock:
         self._pace.ease(task)
         return False
 
-    def room(self, task: str, most: int, then: str) -> int:
+    def room(self, task: str, most: int, then: str = "") -> int:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
         if self._deadline == inf:
             return most
@@ -83,7 +86,18 @@ class Clock:
             self._pace.ease(task)
         return times
 
+    @contextmanager
+    def task(self, name: str) -> Iterator[None]:
+        """Measure what is done within it, less the tasks within."""
+        began, booked = self.elapsed(), self._booked
+        yield
+        own = self.elapsed() - began - (self._booked - booked)
+        self._booked += own
+        self._pace.learn(name, own)
+
     def learn(self, task: str, since: float, times: int = 1) -> None:
         """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""
-        if self._deadline < inf and times:
-            self._pace.learn(task, (self.elapsed() - since) / times)
+        if times:
+            seconds = self.elapsed() - since
+            self._booked += seconds
+            self._pace.learn(task, seconds / times)
