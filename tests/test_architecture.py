@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "scp_mpc"
 FLOORS = [
-    {"errors", "arrays", "provenance", "trajectory"},
+    {"errors", "arrays", "deadline", "provenance", "trajectory"},
     {"robots", "obstacles", "settings"},
     {"safety"},
     {"problem"},

@@ -13,6 +13,7 @@ from scipy import sparse
 from solving import solution
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status
+from scp_mpc.deadline import Clock
 from scp_mpc.errors import BoundsError, InvalidArgumentError, NotFiniteError
 from scp_mpc.qp.active_set import CondensedQP
 from scp_mpc.qp.backend import ProgramSolver, Rows, backend, require_solver
@@ -370,8 +371,8 @@ def pair(seed=0, n=10, K=6):
 def asked(seed, name="osqp", settings=None):
     qp, p, rows = pair(seed)
     solver = ProgramSolver(p, np.arange(0), name, QPSettings() if settings is None else settings)
-    end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)))
-    return solver, end, p
+    end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)), Clock())
+    return solver, end.solution, p
 
 
 @pytest.mark.parametrize("name", ["osqp", "piqp", "clarabel"])
@@ -396,7 +397,9 @@ def test_what_osqp_does_not_finish_goes_to_piqp_and_else_to_nobody(monkeypatch):
     assert sum(alone.finished.values()) == 0
     qp, p, rows = pair(0)
     solver = ProgramSolver(p, np.arange(0), "osqp", QPSettings())
-    assert solver.solve(qp, rows, (np.zeros(10), np.zeros(16)), rescue=False) is None
+    end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)), Clock(deadline=1e-9))
+    assert end.late
+    assert end.solution is None
 
 
 def test_nothing_inaccurate_comes_out(monkeypatch):
@@ -408,7 +411,7 @@ def test_nothing_inaccurate_comes_out(monkeypatch):
         for backend_ in (OSQP, PIQP):
             monkeypatch.setattr(backend_, "run", lambda *_, x=x, wrong=wrong: (x, wrong))
         solver = ProgramSolver(p, np.arange(0), "osqp", QPSettings())
-        end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)))
+        end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)), Clock()).solution
         assert end is None or p.residuals(end.v, -end.force).worst < 1e-8
         monkeypatch.undo()
 
@@ -420,7 +423,9 @@ def test_what_has_no_solution_is_proved_to_have_none_and_piqp_not_asked(monkeypa
     qp.A[-1] = -qp.A[-2]
     monkeypatch.setattr(PIQP, "run", lambda *_: pytest.fail("PIQP was asked"))
     solver = ProgramSolver(p, np.arange(0), "osqp", QPSettings())
-    assert solver.solve(qp, rows, (np.zeros(10), np.zeros(16))) is None
+    end = solver.solve(qp, rows, (np.zeros(10), np.zeros(16)), Clock())
+    assert end.infeasible
+    assert end.solution is None
     assert solver.finished == {"infeasible": 1}
 
 

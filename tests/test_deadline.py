@@ -1,0 +1,51 @@
+"""Predicted times, and what is booked to whom; the clock is read through a fake."""
+
+import pytest
+
+from scp_mpc import deadline
+from scp_mpc.deadline import Clock, Pace
+
+
+@pytest.fixture
+def time(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(deadline, "perf_counter", lambda: now[0])
+    return now
+
+
+def test_tasks_within_a_task_are_not_counted_twice(time):
+    pace = Pace()
+    clock = Clock(1.0, pace)
+    with clock.task("outer"):
+        time[0] += 0.1
+        with clock.task("inner"):
+            time[0] += 0.2
+        began = clock.elapsed()
+        time[0] += 0.3
+        clock.learn("bit", began, 3)
+    assert pace.expected("outer") == pytest.approx(0.1)
+    assert pace.expected("inner") == pytest.approx(0.2)
+    assert pace.expected("bit") == pytest.approx(0.1)
+
+
+def test_nothing_begins_that_would_end_late(time):
+    pace = Pace()
+    pace.learn("task", 0.4)
+    pace.learn("ending", 0.1)
+    clock = Clock(1.0, pace)
+    assert clock.allows("task")
+    assert clock.room("task", 9) == 2
+    time[0] = 0.7
+    assert not clock.allows("task")
+    assert clock.room("task", 9) == 0
+    assert Clock(None, pace).room("task", 9) == 9
+
+
+@pytest.mark.usefixtures("time")
+def test_one_hiccup_does_not_stand_in_the_way_for_ever():
+    pace = Pace()
+    pace.learn("task", 5.0)
+    tries = 0
+    while not Clock(1.0, pace).allows("task"):
+        tries += 1
+    assert 0 < tries < 100
