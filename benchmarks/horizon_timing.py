@@ -24,7 +24,7 @@ from scp_mpc.comparison import Ipopt, Ours, Slsqp, horizon_timing
 def solvers(problem: Problem) -> horizon_timing.Builders:
     """Who takes part; `horizon_timing.everyone` has more."""
     return {
-        "scp_mpc": partial(Ours, problem, challenge=True),
+        "scp_mpc": partial(Ours, problem, multi_start=True),
         "scp_mpc, one start": partial(Ours, problem, Settings(multi_start=False)),
         "ipopt": partial(Ipopt, problem),
         "slsqp": partial(Slsqp, problem),

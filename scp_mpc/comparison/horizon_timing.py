@@ -56,7 +56,7 @@ def everyone(problem: Problem) -> Builders:
     """All solvers, set up for a problem when they are called, by name."""
     return {
         "scp_mpc": partial(Ours, problem, Settings(multi_start=False)),
-        "scp_mpc (multi-start)": partial(Ours, problem, challenge=True),
+        "scp_mpc (multi-start)": partial(Ours, problem, multi_start=True),
         "scp_mpc (piqp)": partial(Ours, problem, Settings(multi_start=False, solver="piqp")),
         "ipopt": partial(Ipopt, problem),
         **{name: partial(Staged, problem, name) for name in SOLVERS},

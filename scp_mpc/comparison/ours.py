@@ -22,15 +22,15 @@ class Ours:
     Args:
         problem: What to solve.
         settings: How to solve it.
-        challenge: Try the other sides at every step, not only where the guess's own fails.
+        multi_start: Try the other sides at every step, not only where the guess's own fails.
     """
 
     def __init__(
-        self, problem: Problem, settings: Settings | None = None, challenge: bool = False
+        self, problem: Problem, settings: Settings | None = None, multi_start: bool = False
     ) -> None:
         """Set up the solver."""
         self._solver = SCP(problem, settings)
-        self._challenge = challenge
+        self._multi_start = multi_start
 
     def solve(
         self,
@@ -41,7 +41,7 @@ class Ours:
     ) -> PeerPlan:
         """Plan from the state x0; arguments as for `SCP.solve`."""
         began = perf_counter()
-        plan = self._solver.solve(x0, x_ref, obstacles, guess, self._challenge)
+        plan = self._solver.solve(x0, x_ref, obstacles, guess, self._multi_start)
         seconds = perf_counter() - began
         problem, start = self._solver.problem, np.asarray(x0, dtype=np.float64)
         return PeerPlan(

@@ -20,7 +20,7 @@ def timing_table(summary: Sequence[Row], origin: Mapping[str, str | int | None])
 
 def measured_on(origin: Mapping[str, str | int | None]) -> str:
     """Return a line on machine, versions, commit and date."""
-    names = ("osqp", "daqp", "casadi")
+    names = ("osqp", "piqp", "casadi")
     versions = ", ".join(f"{name} {origin[name] or 'missing'}" for name in names)
     return (
         f"Measured on {origin['machine']}, {origin['cores']} cores, one thread, "
