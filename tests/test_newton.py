@@ -205,3 +205,19 @@ def test_newton_step_solves_the_kkt_system(seed):
     np.testing.assert_allclose(whole.v, other.v, atol=1e-9)
     np.testing.assert_allclose(whole.force, other.force, atol=1e-9)
     assert newton_step(held, step, -100 * np.eye(8)) is None
+
+
+def test_a_plan_that_is_given_up_within_an_obstacle_says_how_deep():
+    """Time can run out where nobody was to yield, and a violation is one all the same."""
+    case = instance("ahead", 20, "exact", S_REF, 0)
+    at = Transcription(case.problem, Settings(), Nodes.of(case.problem))
+    step = Step.read(case.problem, case.x0, case.x_ref, case.obstacles)
+    at.begin(step, Clock())
+    through = at.at(at.iterate(at.unobstructed(None)))
+    assert not through.slack.any()
+    end = Loop(at).result(through)
+    positions = at.nodes.positions(end.iterate.states, end.iterate.inputs)
+    depths = step.depths(positions, end.iterate.s)
+    assert end.status is Status.VIOLATING
+    assert depths.max() > 0.1
+    np.testing.assert_allclose(end.iterate.slack[: step.count], depths, atol=1e-9)

@@ -131,7 +131,10 @@ class ProgramSolver:
         with clock.task("rescue"):
             self._rescue.load(start)
             end = _attempt(self._rescue, qp, rows, *self._rescue.stages[0], clock)
-        self.finished["piqp"] += end.solution is not None
+        if end.solution is not None:
+            self.finished["piqp"] += 1
+        if end.infeasible:
+            self.finished["infeasible"] += 1
         return end
 
     def rank(

@@ -1,8 +1,8 @@
 """Sequential convex programming: the loop.
 
     nominal = the plan to start from
-    repeat:  linearise   dynamics about the nominal, half-spaces of the obstacles that are near
-             write       values into the fixed pattern of the program
+    repeat:  linearise   the dynamics about the nominal
+             write       their values, and half-spaces of near obstacles, into the fixed pattern
              solve       OSQP, warm-started; the active set that it names, solved exactly
              refine      Newton's step on that active set, where it exists (newton.py)
              certify     the plan it leads to, against the original problem (certificate.py)
@@ -10,19 +10,20 @@
              accept      the plan as the next nominal, or trust a smaller region (trust_region.py)
     until    certified, or the time is up
 
-For a linear robot half-spaces are sound about any point, so the merit cannot rise and every plan is
-accepted. Two cases have no Newton step there: where it would break a constraint, its end is where
-to linearise next; where the convex steps lead away, for they grow, the next half-spaces are about a
-point several steps ahead, and such a leap is taken back if it costs more. For a nonlinear robot a
-trust region bounds what the inputs change by, and the merit is cost and penalty on all violations.
+For a linear robot half-spaces are sound about any point: a convex step cannot raise the merit, a
+Newton step hardly, and all plans are accepted. Where one would break a constraint, its end
+is where to linearise next; where the convex steps grow, the next half-spaces are about a point
+several steps ahead, and such a leap is taken back if it costs more. For a nonlinear robot a trust
+region bounds what the inputs change by, and the merit is cost and penalty on all violations.
 """
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.scp.certificate import BENT, Nominal
+from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record, recorded
 from scp_mpc.scp.newton import corrected, downhill, refined
 from scp_mpc.scp.plan import Result, judge
@@ -35,11 +36,7 @@ _LEAST_COST = 1e-3  # relative to which products of forces and gaps are judged
 
 
 class Loop:
-    """Solves control steps that a transcription has begun.
-
-    Args:
-        at: The step in numbers.
-    """
+    """Solves the control steps that a transcription has begun."""
 
     def __init__(self, at: Transcription) -> None:
         """Remember it, and the settings."""
@@ -51,80 +48,80 @@ class Loop:
         goal: Result | None = None,
         about: FloatArray | None = None,
         limit: int | None = None,
-        screen: bool = True,
         firm: bool = False,
     ) -> Result | None:
-        """Descend from a plan; None if not even the first program was solved, or if given up.
+        """Descend from a plan; None if no plan was accepted, or if given up.
 
         Args:
             nominal: Where to begin.
             goal: Give up when it is plain that this plan will not be reached.
             about: (ny,) where the first half-spaces are taken, which need not obey the dynamics.
             limit: Iterations at most; None for as many as the settings allow.
-            screen: Whether to look for obstacles that were left out.
             firm: Whether to give up where the obstacles would have to yield.
         """
         at, clock, history = self._at, self._at.clock, list[Record]()
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
-        region, give, leaps, bold, iterations = Region(at), Relaxation.NOBODY, 0, True, 0
-        best: Nominal | None = None
-        limit = self._settings.max_iterations if limit is None else limit
-        while iterations < limit and clock.allows("iteration"):
+        # give: who may yield; plain: whether Newton's step is left out; leaps: how often in a row
+        # planes were taken ahead of the plan; else they are the nominal's own.
+        region, give, leaps, plain, iterations = Region(at), Relaxation.NOBODY, 0, False, 0
+        reached: Nominal | None = None  # the last plan that was accepted
+        while iterations < (limit or self._settings.max_iterations) and clock.allows("iteration"):
             with clock.task("iteration"):
                 condensed = at.linearise(nominal)
                 program = at.write(nominal, condensed, planes, give, region.radius)
                 end = at.solve(program, nominal)
-                solution = end.solution
-                if solution is not None:
-                    step, ahead = (
-                        refined(at, program, solution, leaps) if bold else (solution, None)
+                convex = end.solution
+                if convex is not None:
+                    solution, ahead = (
+                        (convex, None) if plain else refined(at, program, convex, leaps)
                     )
-                    trial = at.certify(program, step)
-            if solution is None:
-                if planes is not nominal.planes and best is not None:
-                    planes, leaps, bold = nominal.planes, 0, False  # it was a leap too far
+                    trial = at.certify(program, solution)
+            if convex is None:
+                if planes is not nominal.planes and reached is not None:
+                    planes, leaps, plain = nominal.planes, 0, True  # it was a leap too far
                     continue
                 more = at.next_relaxation(give, firm or not len(nominal.force))
                 if more is None or end.late:
                     break
-                give = more
+                give = more  # no solution, or none found: the next ones may yield
                 continue
             iterations += 1
-            left_out = at.screen(trial) if screen else None
-            if left_out is not None:  # they enter, and the program is solved again
-                own, nominal = planes is nominal.planes, at.with_pairs(nominal, left_out)
-                planes = nominal.planes if own else left_out.planes(planes.y)
+            wider = at.screen(trial)
+            if wider is not None:  # who was left out enters, and the program is solved again
+                own, nominal = planes is nominal.planes, at.with_pairs(nominal, wider)
+                planes = nominal.planes if own else wider.planes(planes.y)
                 continue
-            accepted = region.accepts(nominal, best, trial, program, solution, step, leaps)
+            accepted = region.accepts(nominal, reached, trial, program, convex, solution, leaps)
             if not accepted and not at.linear:
-                step = corrected(program, step, trial)
-                trial = at.certify(program, step)
-                accepted = region.accepts(nominal, best, trial, program, solution, step, leaps)
+                solution = corrected(program, solution, trial)
+                trial = at.certify(program, solution)
+                accepted = region.accepts(nominal, reached, trial, program, convex, solution, leaps)
             if self._settings.history:
-                history.append(recorded(at, nominal, program, solution, trial, accepted))
+                history.append(recorded(at, nominal, program, convex, trial, accepted))
             if not accepted:
-                if leaps and best is not None:
-                    nominal, planes, leaps, bold = best, best.planes, 0, False  # take it back
-                elif not region.shrinks(nominal, program, step):
+                if leaps and reached is not None:  # take the leap back
+                    nominal, planes, leaps, plain = reached, reached.planes, 0, True
+                elif not region.shrinks(nominal, program, solution):
                     break
                 continue
-            before, residuals = inf if best is None else best.residuals.worst, trial.residuals
-            nominal = best = trial
+            before = inf if reached is None else reached.residuals.worst
+            nominal = reached = trial
             give = give if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
             if self._is_converged(trial, before):
-                best, direction = at.second_order(trial, program, step)
-                saddle = best.residuals.curvature < -BENT
-                away = downhill(at, trial, direction) if saddle else None
+                reached, direction = at.second_order(trial, program, solution)
+                away = downhill(at, reached, direction)
                 if away is None:
                     break
-                nominal, planes, leaps, bold = away, away.planes, 0, True
+                nominal, planes, leaps, plain = away, away.planes, 0, False
                 continue
             if goal is not None and is_vain(at, iterations, trial, goal):
                 return None
             leaps = 0 if ahead is None else leaps + 1
             planes = trial.planes if ahead is None else trial.pairs.planes(ahead)
-            bold = not at.linear or leaps > 0 or step is solution or residuals.worst < before / 2
-        return None if best is None else self.result(best, give, iterations, tuple(history))
+            # A Newton step that does not halve the residual is followed by a plain convex one.
+            slow = solution is not convex and trial.residuals.worst >= before / 2
+            plain = at.linear and not leaps and slow
+        return None if reached is None else self.result(reached, give, iterations, tuple(history))
 
     def result(
         self,
@@ -136,10 +133,10 @@ class Loop:
         """Judge a plan."""
         at, residuals, tolerance = self._at, nominal.residuals, self._settings.tolerance
         most = float(max(nominal.slack.max(initial=0.0), nominal.excess.max(initial=0.0)))
-        status, slack = judge(residuals, most, tolerance), nominal.slack
-        if not status.certified and residuals.feasibility > tolerance:
-            slack = np.maximum(-nominal.planes.g, 0.0)
-        merit = at.merit(nominal.cost, float(slack.sum()), nominal.excess)
+        status = judge(residuals, most, tolerance)
+        if not status.certified and residuals.feasibility > tolerance:  # then all of it counts
+            nominal = replace(nominal, slack=np.maximum(-nominal.planes.g, 0.0))
+        merit = at.merit(nominal.cost, float(nominal.slack.sum()), nominal.excess)
         cap = at.problem.slack_weight if give is Relaxation.EVERYBODY else inf
         iterate = at.iterate(nominal, cap)
         return Result(iterate, nominal.cost, merit, residuals, status, iterations, nominal, history)

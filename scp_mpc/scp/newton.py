@@ -3,15 +3,15 @@
 The convex subproblem leaves out that half-spaces turn as the plan moves along a curved obstacle. A
 step d of it, with forces lambda, is followed by T d, then T^2 d and so on, where
 
-    T = (I - A'(A A')^-1 A) K,    K = sum_k lambda_k L_k L_k'
+    T = (I - A'(A A')^-1 A) L'L
 
 maps a displacement to the one that the turned half-spaces cause, within the active set A. So the
 convex steps converge if and only if T contracts; then their sum is Newton's step on the original
 problem's KKT conditions,
 
-    (I - T)^-1 d = d + P L (I - L' P L)^-1 L' d,    P = I - A'(A A')^-1 A
+    (I - T)^-1 d = d + P L'(I - L P L')^-1 L d,    P = I - A'(A A')^-1 A
 
-and I - L' P L is positive definite: the second-order condition. Where it is not, the convex steps
+and I - L P L' is positive definite: the second-order condition. Where it is not, the convex steps
 lead away from this point, and there is nothing to sum.
 
 Where the dynamics bend, too, the second derivative of the Lagrangian is I + W with any symmetric W,
@@ -31,7 +31,7 @@ from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.active_set import QPSolution, holds
-from scp_mpc.scp.certificate import Nominal
+from scp_mpc.scp.certificate import BENT, Nominal
 from scp_mpc.scp.transcription import Program, Transcription
 
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
@@ -97,7 +97,7 @@ def summed(solution: QPSolution, bends: FloatArray, step: FloatArray) -> QPSolut
     Args:
         solution: Of the convex subproblem.
         bends: (q, nv) L, as above.
-        step: (q,) L' d: the convex step as the bends see it.
+        step: (q,) L d: the convex step as the bends see it.
     """
     bent = np.eye(len(bends)) - bends @ bends.T
     within = np.zeros((0, len(bends)))
@@ -147,19 +147,22 @@ def downhill(at: Transcription, saddle: Nominal, direction: FloatArray) -> Nomin
 
     The first of some ever shorter steps, to either side, after which the merit is less.
     """
-    problem, weight = at.problem, at.problem.slack_weight
+    problem = at.problem
     span = np.where(problem.u_max > problem.u_min, problem.u_max - problem.u_min, 1.0)
     largest = float(np.abs(direction / span).max())
-    if not largest > 0:
+    if not (saddle.residuals.curvature < -BENT and largest > 0):
         return None
-    before = saddle.cost + weight * float(np.maximum(-saddle.planes.g, 0.0).sum())
+    before = _merit(at, saddle)
     s = saddle.y[at.layout.s]
     for length in _STEPS:
         for sign in (length, -length):
             inputs = saddle.rollout.inputs + sign / largest * direction
             y, rollout = at.rolled(inputs, s)
             trial = at.nominal(y, rollout, saddle.reaction, saddle.pairs, 0 * saddle.force)
-            after = trial.cost + weight * float(np.maximum(-trial.planes.g, 0.0).sum())
-            if after < before - _LESS * abs(before):
+            if _merit(at, trial) < before - _LESS * abs(before):
                 return trial
     return None
+
+
+def _merit(at: Transcription, plan: Nominal) -> float:
+    return at.merit(plan.cost, float(np.maximum(-plan.planes.g, 0.0).sum()), plan.excess)

@@ -196,8 +196,8 @@ class Result:
 
 def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
     """Return the status of a plan with the given residuals and largest slack."""
-    inside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
+    outside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
     certified = residuals.worst <= tolerance and slack == slack
     if certified and not residuals.curvature < -BENT:
-        return Status.SOFTENED if inside else Status.CONVERGED
-    return Status.VIOLATING if inside else Status.FEASIBLE
+        return Status.SOFTENED if outside else Status.CONVERGED
+    return Status.VIOLATING if outside else Status.FEASIBLE

@@ -14,7 +14,8 @@ _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 def is_vain(at: Transcription, iterations: int, trial: Nominal, goal: Result) -> bool:
     """Whether a run is too far above the goal, or about to end just there.
 
-    The cost falls from one iteration to the next, by less each time.
+    The cost falls from one iteration to the next, by less each time; where Newton's steps raise it,
+    that is far less than what counts here.
     """
     cost, other = trial.cost, goal.iterate
     if goal.status.ok and iterations >= _PATIENCE and cost > _FAR * goal.merit:

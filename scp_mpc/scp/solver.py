@@ -285,7 +285,7 @@ class SCP:
                     start = other if merits[1] < merits[0] else start
             found = None
             if last is None or not last.touches or at.clock.room("iteration", 2) == 2:
-                found = self._loop.run(start, limit=limit, screen=False)
+                found = self._loop.run(start, limit=limit)
             plan = start if found is None or found.nominal is None else found.nominal
         return plan
 

@@ -10,9 +10,11 @@ Only this file knows the order of its variables and rows:
     half-spaces     normal' p_c + slope s_j + slack_c >= offset, with p_c = C e + D u + rest
 
 There is a fixed number of slots for half-spaces at each node, for the nearest obstacles; empty ones
-hold zeros. A firm program has no slack; an elastic one has below and above for bounded states and
-slack for half-spaces, each at its price per unit: the exact L1 penalty. OSQP's 1/2 against our none
-makes P = 2 diag(Q, .., Qf, R, .., w), to which curvature may be added stage by stage.
+hold zeros. Near pairs beyond that are in the condensed program only, against which `active_set.py`
+checks whatever OSQP says, and join there where they must. A firm program has no slack; an elastic
+one has below and above for bounded states and slack for half-spaces, each at its price per unit:
+the exact L1 penalty. OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w), to which
+curvature may be added stage by stage.
 
 Notation:
     C       collision nodes, n d coordinates of them at each sample, S slots at each

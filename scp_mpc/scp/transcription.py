@@ -217,8 +217,13 @@ class Transcription:
         return near if near.any() else ~near
 
     def screen(self, plan: Nominal) -> Pairs | None:
-        """The pairs that a program should have held; None if its plan violates none without."""
+        """The pairs that a program should have held; None if its plan violates none without.
+
+        A plan without any pairs ignores the obstacles on purpose.
+        """
         near = plan.pairs.near
+        if not near.any():
+            return None
         missed = self.step.within(self.path(plan.y), plan.y[self.layout.s], 0.0, known=near)
         if missed is None:
             return None
