@@ -93,12 +93,14 @@ def report(
         float | None, typer.Option(help="Smallest size s; s_ref if not given.")
     ] = None,
     animation: Annotated[bool, typer.Option(help="Write the animated GIF too.")] = True,
-    sides: Annotated[bool, typer.Option(help="Try to pass obstacles on either side.")] = True,
+    multi_start: Annotated[
+        bool, typer.Option(help="Try other ways past the obstacles, too.")
+    ] = True,
 ) -> None:
     """Run the four scenarios; write their table, figures and animation."""
     with _one_line_errors():
         margin = Margin() if s_min is None else Margin(lower=s_min)
-        settings = Settings(multi_start=sides)
+        settings = Settings(multi_start=multi_start)
         shape = cast(Literal["axes", "exact"], inflation)  # the problem checks it
         problems = {name: o.problem(shape, margin) for name, o in SCENARIOS.items()}
         as_count("steps", steps)

@@ -51,7 +51,13 @@ def test_scaling_counts_and_fits():
         assert sum(row["statuses"].values()) == row["steps"] == 4
         assert 0 < row["median_ms"] <= row["p99_ms"] <= row["max_ms"]
     made_up = [
-        {"world": "crowd", "sides": False, "horizon": N, "obstacles": M, "median_ms": N**1.5 * M**2}
+        {
+            "world": "crowd",
+            "multi_start": False,
+            "horizon": N,
+            "obstacles": M,
+            "median_ms": N**1.5 * M**2,
+        }
         for N in (8, 30, 60, 120)
         for M in (1, 5)
     ]

@@ -44,7 +44,16 @@ def test_report_writes_everything(tmp_path):
 
 def test_report_passes_its_options_on(tmp_path, monkeypatch):
     monkeypatch.setattr(scp_mpc.cli, "write_figures", lambda *_: [])
-    options = ["--inflation", "exact", "--s-min", 1.5, "--seed", 3, "--no-sides", "--no-animation"]
+    options = [
+        "--inflation",
+        "exact",
+        "--s-min",
+        1.5,
+        "--seed",
+        3,
+        "--no-multi-start",
+        "--no-animation",
+    ]
     result = invoke("report", "--out", tmp_path, "--steps", 2, *options)
     assert result.exit_code == 0, result.output
     assert not list(tmp_path.glob("*.gif"))

@@ -42,7 +42,7 @@ def test_clearance_is_between_surfaces():
 def test_a_tiny_run_is_counted_and_drawn():
     courses = [robots.COURSES[0], robots.Course("unicycle", Circuit("unicycle", 8, 2), 4)]
     table = robots.rows(3, courses)
-    assert [row["sides"] for row in table] == [True, False] * 2
+    assert [row["multi_start"] for row in table] == [True, False] * 2
     assert table[0]["thread_median_ratio"] == table[0]["wall_p99_ratio"] == 1.0
     for row in table:
         assert sum(row["statuses"].values()) == row["steps"] == 3

@@ -39,6 +39,7 @@ from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
 NAME = "horizon_timing"  # of the files
+WITH_CROWDS = "horizon"  # likewise, with crowds
 SLOW_STEPS = 20
 _SCENARIOS: tuple[Scenario | Crowd, ...] = (SCENARIOS["scenario-2"], SCENARIOS["scenario-1"])
 CROWDS = (Crowd(30, 5), Crowd(30, 12))
@@ -152,8 +153,9 @@ def main(
         json_path.write_text(content + "\n", encoding="utf-8")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        (out / f"{NAME}.md").write_text(table + "\n", encoding="utf-8")
-        timing_figure(contests).savefig(out / f"{NAME}.png", dpi=150)
+        name = WITH_CROWDS if crowds else NAME
+        (out / f"{name}.md").write_text(table + "\n", encoding="utf-8")
+        timing_figure(contests).savefig(out / f"{name}.png", dpi=150)
 
 
 def _contests(

@@ -83,7 +83,9 @@ def rows(steps: int, courses: Sequence[Course] | None = None) -> list[dict[str, 
     courses = COURSES if courses is None else courses
     with progress(2 * len(courses) * steps) as advance:
         table = [
-            _row(course, sides, steps, advance) for course in courses for sides in (True, False)
+            _row(course, multi_start, steps, advance)
+            for course in courses
+            for multi_start in (True, False)
         ]
     for row in table:
         for clock in ("wall", "thread"):
@@ -95,7 +97,7 @@ def rows(steps: int, courses: Sequence[Course] | None = None) -> list[dict[str, 
 def markdown(table: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown; ratios are those of the thread's time."""
     head = (
-        "| Robot | N | Obstacles | Points | Sides | Median [ms] | p99 [ms] | Max [ms] "
+        "| Robot | N | Obstacles | Points | Multi-start | Median [ms] | p99 [ms] | Max [ms] "
         "| Thread: median, p99 [ms] | Median ratio | p99 ratio | Certified, no slack "
         "| Iterations: median, max | Clearance [m] |\n"
         "|:--|--:|--:|--:|:--|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
@@ -103,13 +105,15 @@ def markdown(table: Sequence[dict[str, Any]]) -> str:
     return "\n".join([head, *map(_line, table)])
 
 
-def _row(course: Course, sides: bool, steps: int, advance: Callable[[], object]) -> dict[str, Any]:
+def _row(
+    course: Course, multi_start: bool, steps: int, advance: Callable[[], object]
+) -> dict[str, Any]:
     problem, world, x = course.problem, course.world, course.world.start()
     given: Callable[[int], tuple[FloatArray, list[ObstaclePrediction]]] = lambda k: (  # noqa: E731
         world.states(k),
         world.predictions(k),
     )
-    settings = Settings(multi_start=sides)
+    settings = Settings(multi_start=multi_start)
     MPC(problem, settings).step(x, *given(0))
     mpc, plans, wall, thread, gaps = MPC(problem, settings), [], [], [], []
     gc.collect()
@@ -136,7 +140,7 @@ def _row(course: Course, sides: bool, steps: int, advance: Callable[[], object])
         "horizon": problem.horizon,
         "obstacles": problem.max_obstacles,
         "points": problem.nodes_per_interval,
-        "sides": sides,
+        "multi_start": multi_start,
         "steps": steps,
         "wall": _summary(wall),
         "thread": _summary(thread),
@@ -160,7 +164,7 @@ def _line(row: dict[str, Any]) -> str:
     thread = row["thread"]
     cells = (
         *(row[key] for key in ("robot", "horizon", "obstacles", "points")),
-        "on" if row["sides"] else "off",
+        "on" if row["multi_start"] else "off",
         *(f"{row['wall'][key]:.2f}" for key in ("median", "p99", "max")),
         f"{thread['median']:.2f}, {thread['p99']:.2f}",
         *(f"{row[f'thread_{key}_ratio']:.2f}" for key in ("median", "p99")),

@@ -12,17 +12,17 @@ _COLOURS = {True: "#D55E00", False: "#0072B2"}  # Okabe and Ito's
 
 
 def robots_figure(table: Sequence[dict[str, Any]]) -> Figure:
-    """Draw a row per course: the ways past tried at every step, and the side kept."""
+    """Draw a row per course: multi-start at every step, and one start."""
     names = list(dict.fromkeys(map(_name, table)))
     figure = Figure(figsize=(11.0, 1.6 + 0.45 * len(names)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for sides, shift in ((True, -0.15), (False, 0.15)):
-        part = [row for row in table if row["sides"] is sides]
+    for multi_start, shift in ((True, -0.15), (False, 0.15)):
+        part = [row for row in table if row["multi_start"] is multi_start]
         y = np.array([names.index(_name(row)) for row in part]) + shift
         median = [row["wall"]["median"] for row in part]
         p99 = [row["wall"]["p99"] for row in part]
-        colour, label = _COLOURS[sides], "ways past tried" if sides else "side kept"
+        colour, label = _COLOURS[multi_start], "multi-start" if multi_start else "one start"
         axes.hlines(y, median, p99, color=colour, linewidth=2.0)
         axes.plot(median, y, "o", color=colour, label=f"{label}: median")
         axes.plot(p99, y, "|", color=colour, markersize=12, label=f"{label}: p99")

@@ -28,14 +28,14 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], None]
         echo: Takes the Markdown table.
     """
     if name == "horizon":
-        numbers = out / f"{horizon_timing.NAME}.json"
+        numbers = out / f"{horizon_timing.WITH_CROWDS}.json"
         horizon_timing.main(numbers, out, steps, seed, echo=echo, crowds=True)
     elif name == "scaling":
         table = in_one_thread(scaling.rows, steps)
         fitted = scaling.exponents(table)
         text = scaling.markdown(table) + (
-            f"\n\nMedian ~ N^{fitted['a']:.2f} (one obstacle, N >= 30, sides off), "
-            f"~ M^{fitted['b']:.2f} (N = 30, sides off)."
+            f"\n\nMedian ~ N^{fitted['a']:.2f} (one obstacle, N >= 30, one start), "
+            f"~ M^{fitted['b']:.2f} (N = 30, one start)."
         )
         _write(out, scaling.NAME, text, {"rows": table, "exponents": fitted}, echo)
         _save(scaling_figure(table, fitted), out / f"{scaling.NAME}.png")

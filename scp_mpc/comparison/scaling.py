@@ -40,14 +40,18 @@ def rows(
     """
     worlds: list[Scenario | Crowd] = [SCENARIOS["scenario-2"], SCENARIOS["scenario-1"]]
     worlds += [Crowd(N, M) for N, M in product(horizons, obstacles)]
-    jobs = [(world, sides, _steps(world, steps)) for world in worlds for sides in (False, True)]
+    jobs = [
+        (world, multi_start, _steps(world, steps))
+        for world in worlds
+        for multi_start in (False, True)
+    ]
     with progress(sum(count for *_, count in jobs)) as advance:
-        return [_row(world, sides, count, advance) for world, sides, count in jobs]
+        return [_row(world, multi_start, count, advance) for world, multi_start, count in jobs]
 
 
 def exponents(table: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Fit time ~ N^a for one obstacle from N = 30 on, and time ~ M^b at N = 30, to the medians."""
-    crowds = [row for row in table if row["world"].startswith("crowd") and not row["sides"]]
+    crowds = [row for row in table if row["world"].startswith("crowd") and not row["multi_start"]]
     along = [(row["horizon"], row["median_ms"]) for row in crowds if row["obstacles"] == 1]
     across = [(row["obstacles"], row["median_ms"]) for row in crowds if row["horizon"] == 30]
     return {"a": _slope([p for p in along if p[0] >= 30]), "b": _slope(across)}
@@ -56,8 +60,8 @@ def exponents(table: Sequence[dict[str, Any]]) -> dict[str, float]:
 def markdown(table: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown."""
     head = (
-        "| Problem | N | Obstacles | Sides | Steps | Active | Median [ms] | p99 [ms] | Max [ms] "
-        "| Certified, no slack | Softened | Other | Programs |\n"
+        "| Problem | N | Obstacles | Multi-start | Steps | Active | Median [ms] | p99 [ms] "
+        "| Max [ms] | Certified, no slack | Softened | Other | Programs |\n"
         "|:--|--:|--:|:--|--:|--:|--:|--:|--:|--:|--:|--:|:--|"
     )
     return "\n".join([head, *map(_line, table)])
@@ -69,9 +73,9 @@ def _steps(world: Scenario | Crowd, steps: int) -> int:
 
 
 def _row(
-    world: Scenario | Crowd, sides: bool, steps: int, advance: Callable[[], object]
+    world: Scenario | Crowd, multi_start: bool, steps: int, advance: Callable[[], object]
 ) -> dict[str, Any]:
-    plans, seconds = zip(*_drive(world, sides, steps, advance), strict=True)
+    plans, seconds = zip(*_drive(world, multi_start, steps, advance), strict=True)
     times: FloatArray = 1e3 * np.array(seconds)
     statuses = Counter(plan.status.name for plan in plans)
     programs: Counter[str] = sum((Counter(plan.qps) for plan in plans), Counter())
@@ -79,7 +83,7 @@ def _row(
         "world": world.name,
         "horizon": world.horizon,
         "obstacles": len(world.predictions(0)),
-        "sides": sides,
+        "multi_start": multi_start,
         "steps": steps,
         "active": sum(plan.iterate.touches for plan in plans),
         "median_ms": float(np.median(times)),
@@ -92,12 +96,12 @@ def _row(
 
 
 def _drive(
-    world: Scenario | Crowd, sides: bool, steps: int, advance: Callable[[], object]
+    world: Scenario | Crowd, multi_start: bool, steps: int, advance: Callable[[], object]
 ) -> Iterator[tuple[Plan, float]]:
     """A closed loop without disturbance; one step solved before the clock runs."""
     problem = world.problem("axes")
     MPC(problem).step(world.start(), world.states(0), world.predictions(0))
-    mpc, x = MPC(problem, Settings(multi_start=sides)), world.start()
+    mpc, x = MPC(problem, Settings(multi_start=multi_start)), world.start()
     gc.collect()
     for k in range(steps):
         x_ref, obstacles = world.states(k), world.predictions(k)
@@ -122,7 +126,7 @@ def _line(row: dict[str, Any]) -> str:
         row["world"],
         row["horizon"],
         row["obstacles"],
-        "on" if row["sides"] else "off",
+        "on" if row["multi_start"] else "off",
         row["steps"],
         row["active"],
         *(f"{row[key]:.2f}" for key in ("median_ms", "p99_ms", "max_ms")),

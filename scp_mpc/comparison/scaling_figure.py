@@ -18,7 +18,7 @@ def scaling_figure(table: Sequence[dict[str, Any]], fitted: dict[str, float]) ->
     """Draw one curve per number of obstacles over N, and one per horizon over the obstacles."""
     figure = Figure(figsize=(12.5, 6.0), layout="constrained")
     FigureCanvasAgg(figure)
-    crowds = [row for row in table if row["world"].startswith("crowd") and row["sides"]]
+    crowds = [row for row in table if row["world"].startswith("crowd") and row["multi_start"]]
     panels = figure.subplots(1, 2, sharey=True)
     for axes, along, across, label in (
         (panels[0], "horizon", "obstacles", "M ="),
@@ -52,8 +52,8 @@ def scaling_figure(table: Sequence[dict[str, Any]], fitted: dict[str, float]) ->
     panels[0].set_xlabel("horizon N", fontsize=13)
     panels[1].set_xlabel("obstacles M", fontsize=13)
     panels[0].set_ylabel("time per control step [ms]", fontsize=13)
-    panels[0].set_title(f"side kept, M = 1, N >= 30: median ~ N^{fitted['a']:.2f}", fontsize=13)
-    panels[1].set_title(f"side kept, N = 30: median ~ M^{fitted['b']:.2f}", fontsize=13)
+    panels[0].set_title(f"one start, M = 1, N >= 30: median ~ N^{fitted['a']:.2f}", fontsize=13)
+    panels[1].set_title(f"one start, N = 30: median ~ M^{fitted['b']:.2f}", fontsize=13)
     figure.suptitle(
         "Solid: median, dotted: 99th percentile, with the ways past tried at every step",
         fontsize=12,
