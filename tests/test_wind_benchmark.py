@@ -53,14 +53,14 @@ def test_without_a_disturbance_rejection_is_no_worse():
 
 
 def test_the_reports_way_is_the_last_plans():
-    ours, report = (Variant(30, False, sides=sides).run(0, 12) for sides in (True, False))
-    assert Variant(30, False, sides=False) == REPORT
+    ours, report = (Variant(30, False, multi_start=sides).run(0, 12) for sides in (True, False))
+    assert Variant(30, False, multi_start=False) == REPORT
     assert max(len(plan.candidates) for plan in ours.plans[1:]) > 1
     assert not any(plan.candidates for plan in report.plans)
 
 
 def test_a_row_says_how_far_it_is_from_the_reports_way():
-    variants = [Variant(8, False), Variant(8, True), Variant(8, False, sides=False)]
+    variants = [Variant(8, False), Variant(8, True), Variant(8, False, multi_start=False)]
     runs = [
         {"rms": rms, "median": rms, "clearance": 0.0, "distance": 0.0}
         | dict.fromkeys(("contact", "slack", "not_ok"), 0)

@@ -111,7 +111,7 @@ def measured(
         for variant in variants
     }
     first = {variant.disturbance: runs[variant] for variant in reversed(variants)}
-    report = {v.disturbance: runs[v] for v in reversed(variants) if not v.sides}
+    report = {v.disturbance: runs[v] for v in reversed(variants) if not v.multi_start}
     return [summary(v, runs[v], first[v.disturbance], report.get(v.disturbance)) for v in variants]
 
 

@@ -57,7 +57,7 @@ class Variant:
         foresight: See `WindAwareMPC`.
         obstacle: Whether there is one.
         inflation: Of the no-go set.
-        sides: Whether other ways past the obstacle are tried; the report keeps to its side.
+        multi_start: Whether other ways past the obstacle are tried; the report keeps to its side.
     """
 
     horizon: int
@@ -67,7 +67,7 @@ class Variant:
     foresight: Foresight = "none"
     obstacle: bool = True
     inflation: str = "axes"
-    sides: bool = True
+    multi_start: bool = True
 
     @property
     def random(self) -> bool:
@@ -80,7 +80,7 @@ class Variant:
         words = "rejection" if self.rejects else "nominal"
         if self.thrift is not None:
             words += " + terminal"
-        if not self.sides:
+        if not self.multi_start:
             words += ", keeps its side"
         return words if self.foresight == "none" else f"{words} + spread, {self.foresight}"
 
@@ -100,7 +100,7 @@ class Variant:
         if not self.obstacle:
             scenario = replace(scenario, obstacle=replace(scenario.obstacle, track_radius=_FAR))
         problem = scenario.problem("exact" if self.inflation == "exact" else "axes")
-        settings = Settings(multi_start=self.sides)
+        settings = Settings(multi_start=self.multi_start)
         return simulate(
             scenario, problem, settings, steps=steps, seed=seed, controller=self._controller
         )
@@ -121,13 +121,13 @@ class Variant:
         return MPC(problem, settings)
 
 
-OURS, REPORT = Variant(30, False), Variant(30, False, sides=False)
+OURS, REPORT = Variant(30, False), Variant(30, False, multi_start=False)
 NOMINAL, BEST = Variant(8, False), Variant(8, True, thrift=THRIFT)
 MAIN = (
     OURS,
     REPORT,
     NOMINAL,
-    Variant(8, False, sides=False),
+    Variant(8, False, multi_start=False),
     Variant(8, False, thrift=THRIFT),
     Variant(8, True),
     BEST,
@@ -136,7 +136,7 @@ MAIN = (
 )
 CALM = (
     Variant(30, False, "none"),
-    Variant(30, False, "none", sides=False),
+    Variant(30, False, "none", multi_start=False),
     Variant(8, False, "none"),
     Variant(8, True, "none"),
     Variant(8, True, "none", thrift=THRIFT),
