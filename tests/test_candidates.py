@@ -5,8 +5,9 @@ import pytest
 from instances import S_REF, obstacle, problem, rotated, straight_reference
 from solving import half_spaces
 
-from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction
+from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction, Settings
 from scp_mpc.scp.candidates import MAX_CANDIDATES, Passing, candidates, same_way
+from scp_mpc.scp.multi_start import Present
 from scp_mpc.scp.step import Step
 
 N = 20
@@ -146,16 +147,16 @@ def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
 
 def test_rivals_begin_at_the_state_not_at_the_reference(monkeypatch):
     case, ref = problem(20), straight_reference(20)
-    solver, x0, starts = SCP(case), ref[0] + [-0.3, 0.2, 0.2, 0.0], []
-    search = solver._multi_start
-    rank = search._rank
+    solver = SCP(case, Settings(max_candidates=3))
+    x0, starts = ref[0] + [-0.3, 0.2, 0.2, 0.0], []
+    start_from = Present.start
 
-    def noting(*given):
-        found = rank(*given)
-        starts.extend(one.start.rollout for one in found if one.start is not None)
-        return found
+    def noting(present, one):
+        plan = start_from(present, one)
+        starts.append(plan.rollout)
+        return plan
 
-    monkeypatch.setattr(search, "_rank", noting)
+    monkeypatch.setattr(Present, "start", noting)
     solver.solve(x0, ref, [obstacle(20, (3.0, 0.1), (0.5, 0.0))])
     assert starts
     for start in starts:

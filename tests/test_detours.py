@@ -44,7 +44,7 @@ def rooms(path, j):
 
 @pytest.mark.parametrize("side", [UP, -UP, np.array([-1.0, 0.0])])
 def test_points_within_go_straight_to_the_side_and_no_others(step, side):
-    moved = walls(step, 0).aside(PATH, side)
+    moved = walls(step, 0).aside(PATH[None], side[None])[0]
     within = rooms(PATH, 0) < 0
     assert 2 <= within.sum() < N
     np.testing.assert_array_equal(moved[~within], PATH[~within])
@@ -60,7 +60,8 @@ def test_out_of_one_and_of_what_comes_next():
     boxes = [Polytope.box([1.0, 1.0]).still(N, (0.0, y)) for y in (1.1, 0.0, 2.2)]
     case = problem(N, max_obstacles=3)
     stack = Step.read(case, np.zeros(4), np.zeros(4), boxes)
-    moved = Walls.of(stack, np.zeros(3), np.arange(3), slice(0, N)).aside(np.zeros((N, 2)), UP)
+    moved = Walls.of(stack, np.zeros(3), np.arange(3), slice(0, N))
+    moved = moved.aside(np.zeros((1, N, 2)), UP[None])[0]
     np.testing.assert_allclose(moved, np.tile([0.0, 2.85], (N, 1)))
 
 
@@ -75,7 +76,7 @@ def test_each_polytope_towards_a_side_of_its_own(step):
 
 
 def test_outward_is_through_the_nearest_face_bent_to_the_side(step):
-    moved = walls(step, 1).outward(PATH, UP)
+    moved = walls(step, 1).outward(PATH[None], UP[None])[0]
     within = rooms(PATH, 1) < 0
     assert (rooms(moved, 1)[within] > -1e-6).all()
     assert (moved[within, 1] > 0).all()
@@ -86,7 +87,7 @@ def test_flips_put_touching_stages_beyond_every_other_face(step):
     touched = np.zeros((1, N), dtype=bool)
     touched[0, 3] = True
     body = walls(step, 0)
-    below = body.aside(PATH, -UP)
+    below = body.aside(PATH[None], -UP[None])[0]
     found = body.flips(below, touched, 1)
     assert len(found) == 3
     here = body.shapes.nearest(below[None] - body.means).normal[0, 3]

@@ -37,9 +37,9 @@ _MIXED = 3  # polytopes whose sides are tried in all combinations
 _COSINE = 0.9  # of the angle between two directions that count as one side
 _TOUCH = 1e-9  # [m] less than that within is not within
 _PARALLEL = 1e-9  # cosine below which a face is never reached
-# tau, and whether to leave the no-go set away from its middle: as the free plan would, one stage
+# Whether to leave the no-go set away from its middle, and tau: as the free plan would, one stage
 # later or earlier, two later
-_WAYS = ((0.0, False), (-1.0, False), (1.0, False), (-2.0, True))
+_WAYS = ((False, (0.0, -1.0, 1.0)), (True, (-2.0,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def _together(
     yield Side(j, -v / np.linalg.norm(v), 0.0, waiting)
     body = Walls.of(step, s, walls, slice(0, len(free)))
     for n in normals if len(walls) > 1 else ():
-        yield Side(j, n, 0.0, body.aside(free, n))
+        yield Side(j, n, 0.0, body.aside(free[None], n[None])[0])
     for mixed in product(*[normals[:2]] * min(len(walls), _MIXED)):
         if len(walls) > 1 and any(n is not mixed[0] for n in mixed):
             # Those beyond the first few go with the last of them.
@@ -192,12 +192,14 @@ def _ways(
         body = Walls.of(step, s, np.array([j]), reach)
         for n in body.faces(normals):
             path = elsewhere.copy()
-            path[reach] = body.aside(free[reach], n)
+            path[reach] = body.aside(free[None, reach], n[None])[0]
             yield Side(j, n, 0.0, path)
-    for time, outward in _WAYS:
-        for n in normals:
-            path, moved = elsewhere.copy(), free[reach] + time * v
-            path[reach] = body.outward(moved, n) if outward else body.aside(moved, n)
+    for outward, times in _WAYS:
+        shifts, sides = np.repeat(times, len(normals)), np.tile(np.array(normals), (len(times), 1))
+        moved = free[reach] + shifts[:, None, None] * v
+        paths = np.repeat(elsewhere[None], len(sides), axis=0)
+        paths[:, reach] = (body.outward if outward else body.aside)(moved, sides)
+        for time, n, path in zip(shifts.tolist(), sides, paths, strict=True):
             yield Side(j, n, time, path)
 
 
@@ -235,22 +237,23 @@ class Ellipsoids:
         e = np.maximum(s * np.sqrt(np.maximum(variances, 0.0)) + radii, 1e-9)
         return cls(step.means[j, 1:][reach], np.swapaxes(rotations, 1, 2) / e[..., None])
 
-    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move the points of a path (k, d) that lie within along n to the boundary."""
-        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
-        m = self.scaling @ n
-        mm, wm = (m * m).sum(axis=1), (w * m).sum(axis=1)
-        room = 1 - (w * w).sum(axis=1)  # positive inside
+    def aside(self, paths: FloatArray, sides: FloatArray) -> FloatArray:
+        """Move the points of paths (c, k, d) that lie within along sides (c, d) to the boundary."""
+        w = (self.scaling @ (paths - self.means)[..., None])[..., 0]
+        m = (self.scaling @ sides[:, None, :, None])[..., 0]
+        mm, wm = (m * m).sum(axis=-1), (w * m).sum(axis=-1)
+        room = 1 - (w * w).sum(axis=-1)  # positive inside
         shift = np.where(room > 0, (np.sqrt(wm**2 + mm * np.maximum(room, 0.0)) - wm) / mm, 0.0)
-        return path + shift[:, None] * n
+        moved: FloatArray = paths + shift[..., None] * sides[:, None]
+        return moved
 
-    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move them away from the middle, and half as much towards n, to the boundary."""
-        w = (self.scaling @ (path - self.means)[..., None])[..., 0]
-        m = self.scaling @ n
-        within = (w * w).sum(axis=1) < 1
-        w[within] += 0.5 * m[within] / np.linalg.norm(m[within], axis=1, keepdims=True)
-        w[within] /= np.maximum(np.linalg.norm(w[within], axis=1, keepdims=True), 1e-12)
+    def outward(self, paths: FloatArray, sides: FloatArray) -> FloatArray:
+        """Move them away from the middle, and half as much towards the side, to the boundary."""
+        w = (self.scaling @ (paths - self.means)[..., None])[..., 0]
+        m = (self.scaling @ sides[:, None, :, None])[..., 0]
+        within = (w * w).sum(axis=-1) < 1
+        w[within] += 0.5 * m[within] / np.linalg.norm(m[within], axis=-1, keepdims=True)
+        w[within] /= np.maximum(np.linalg.norm(w[within], axis=-1, keepdims=True), 1e-12)
         boundary: FloatArray = self.means + np.linalg.solve(self.scaling, w[..., None])[..., 0]
         return boundary
 
@@ -279,19 +282,22 @@ class Walls:
                 found.append(n)
         return found
 
-    def aside(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move the points of a path (k, d) that lie within along n to the boundary."""
-        return self._out(path, n)
+    def aside(self, paths: FloatArray, sides: FloatArray) -> FloatArray:
+        """Move the points of paths (c, k, d) that lie within along sides (c, d) to the boundary."""
+        return np.array([self._out(path, n) for path, n in zip(paths, sides, strict=True)])
 
     def apart(self, path: FloatArray, normals: FloatArray) -> FloatArray:
         """The same, but out of each polytope towards a side of its own (w, d)."""
         return self._out(path, normals[:, None])
 
-    def outward(self, path: FloatArray, n: FloatArray) -> FloatArray:
-        """Move them away from the first one, and half as much towards n, to the boundary."""
+    def outward(self, paths: FloatArray, sides: FloatArray) -> FloatArray:
+        """Move them away from the first one, and half as much towards the side, to the boundary."""
         first = self.shapes.taken(np.zeros(1, dtype=np.intp))
-        away = first.nearest((path - self.means[0])[None]).normal[0] + 0.5 * n
-        return self._out(path, away / np.linalg.norm(away, axis=1, keepdims=True))
+        moved = []
+        for path, n in zip(paths, sides, strict=True):
+            away = first.nearest((path - self.means[0])[None]).normal[0] + 0.5 * n
+            moved.append(self._out(path, away / np.linalg.norm(away, axis=1, keepdims=True)))
+        return np.array(moved)
 
     def _out(self, path: FloatArray, along: FloatArray) -> FloatArray:
         """Move what is within along unit vectors (w, k, d): out of one, and of what comes next."""

@@ -25,6 +25,7 @@ class Layout:
         size: ny.
         p: Slice of the positions in y; likewise `s`, `u`, `du` and `z`.
         boxed: Slice of the entries of y that are bounded and can move.
+        bounded: nf, how many these are.
         moving: Sizes that can move: M, or 0.
         variables: nv, inputs and moving sizes.
         shape: (N, nu) of the inputs.
@@ -47,6 +48,7 @@ class Layout:
         self.size = self.z.stop
         self.variables = N * nu + self.moving
         self.boxed = slice(self.s.start if self.moving else self.u.start, self.size)
+        self.bounded = self.size - self.boxed.start
         self.yielding = slice(self.z.start - self.boxed.start, self.size - self.boxed.start)
         self.inputs = slice(self.u.start - self.boxed.start, self.u.stop - self.boxed.start)
         self._lower = self._bounds(-_NONE, problem.size.lower, problem.u_min, problem.du_min)
@@ -134,7 +136,7 @@ class Layout:
 
     def gathered(self, s: FloatArray, u: FloatArray, du: FloatArray, z: FloatArray) -> FloatArray:
         """The inverse of `parted`; empty arrays stand for zeros."""
-        forces = np.zeros(self.size - self.boxed.start)
+        forces = np.zeros(self.bounded)
         forces[: self.moving], forces[self.inputs] = s[: self.moving], u.ravel()
         if du.size:
             forces[self.inputs.stop : self.yielding.start] = du.ravel()

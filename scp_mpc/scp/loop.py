@@ -11,10 +11,8 @@
     until    certified, or the time is up
 
 For a linear robot half-spaces are sound about any point: a convex step cannot raise the merit, a
-Newton step hardly, and all plans are accepted. Where one would break a constraint, its end
-is where to linearise next; where the convex steps grow, the next half-spaces are about a point
-several steps ahead, and such a leap is taken back if it costs more. For a nonlinear robot a trust
-region bounds what the inputs change by, and the merit is cost and penalty on all violations.
+Newton step hardly, and all plans are accepted. For a nonlinear robot a trust region bounds what the
+inputs change by, and the merit is cost and penalty on all violations.
 """
 
 from dataclasses import replace
@@ -61,9 +59,8 @@ class Loop:
         """
         at, clock, history = self._at, self._at.clock, list[Record]()
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
-        # give: who may yield; plain: whether Newton's step is left out; leaps: how often in a row
-        # planes were taken ahead of the plan; else they are the nominal's own.
-        region, give, leaps, plain, iterations = Region(at), Relaxation.NOBODY, 0, False, 0
+        # give: who may yield; plain: whether Newton's step is left out.
+        region, give, plain, iterations = Region(at), Relaxation.NOBODY, False, 0
         reached: Nominal | None = None  # the last plan that was accepted
         while iterations < (limit or self._settings.max_iterations) and clock.allows("iteration"):
             with clock.task("iteration"):
@@ -72,14 +69,9 @@ class Loop:
                 end = at.solve(program, nominal)
                 convex = end.solution
                 if convex is not None:
-                    solution, ahead = (
-                        (convex, None) if plain else refined(at, program, convex, leaps)
-                    )
+                    solution = convex if plain else refined(at, program, convex)
                     trial = at.certify(program, solution)
             if convex is None:
-                if planes is not nominal.planes and reached is not None:
-                    planes, leaps, plain = nominal.planes, 0, True  # it was a leap too far
-                    continue
                 more = at.next_relaxation(give, firm or not len(nominal.force))
                 if more is None or end.late:
                     break
@@ -91,36 +83,33 @@ class Loop:
                 own, nominal = planes is nominal.planes, at.with_pairs(nominal, wider)
                 planes = nominal.planes if own else wider.planes(planes.y)
                 continue
-            accepted = region.accepts(nominal, reached, trial, program, convex, solution, leaps)
+            accepted = region.accepts(nominal, reached, trial, program, convex, solution)
             if not accepted and not at.linear:
                 solution = corrected(program, solution, trial)
                 trial = at.certify(program, solution)
-                accepted = region.accepts(nominal, reached, trial, program, convex, solution, leaps)
+                accepted = region.accepts(nominal, reached, trial, program, convex, solution)
             if self._settings.history:
                 history.append(recorded(at, nominal, program, convex, trial, accepted))
             if not accepted:
-                if leaps and reached is not None:  # take the leap back
-                    nominal, planes, leaps, plain = reached, reached.planes, 0, True
-                elif not region.shrinks(nominal, program, solution):
+                if not region.shrinks(nominal, program, solution):
                     break
                 continue
             before = inf if reached is None else reached.residuals.worst
             nominal = reached = trial
+            planes = trial.planes
             give = give if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
             if self._is_converged(trial, before):
                 reached, direction = at.second_order(trial, program, solution)
                 away = downhill(at, reached, direction)
                 if away is None:
                     break
-                nominal, planes, leaps, plain = away, away.planes, 0, False
+                nominal, planes, plain = away, away.planes, False
                 continue
             if goal is not None and is_vain(at, iterations, trial, goal):
                 return None
-            leaps = 0 if ahead is None else leaps + 1
-            planes = trial.planes if ahead is None else trial.pairs.planes(ahead)
             # A Newton step that does not halve the residual is followed by a plain convex one.
             slow = solution is not convex and trial.residuals.worst >= before / 2
-            plain = at.linear and not leaps and slow
+            plain = at.linear and slow
         return None if reached is None else self.result(reached, give, iterations, tuple(history))
 
     def result(

@@ -14,6 +14,7 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.qp.active_set import CondensedQP
 from scp_mpc.scp.candidates import (
     MAX_CANDIDATES,
     MOST_AMONG_WALLS,
@@ -37,6 +38,9 @@ _BEAM = 3  # ways among polytopes that are varied
 _ROUNDS = 5  # of variations
 _ALIKE = 1e-6  # relative difference of merits that counts as none
 
+# Multipliers of a program about a path: (N, nu) of the input bounds and (M, C) of the obstacles.
+Duals = tuple[FloatArray, FloatArray]
+
 
 @dataclass(frozen=True, eq=False)
 class Ranked:
@@ -45,17 +49,15 @@ class Ranked:
     Attributes:
         merit: Lower bound of its optimum, cost and penalty on the slack; infinite if it has no
             solution, or none that can win.
-        passing: Its positions, and who pushes it where.
-        about: (ny,) the path, where its half-spaces are taken.
-        start: The plan that it seems to lead to, with its multipliers; None if it cannot win.
-        duals: Its multipliers (N, nu) of the input bounds and (M, C) of the obstacles.
+        planes: Its half-spaces, about the path.
+        force: (nf + K,) its multipliers.
+        v: (nv,) the point reached; None if it cannot win.
     """
 
     merit: float
-    passing: Passing
-    about: FloatArray
-    start: Nominal | None
-    duals: tuple[FloatArray, FloatArray]
+    planes: Planes
+    force: FloatArray
+    v: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,128 +115,128 @@ class MultiStart:
         here = Passing(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
         ways, numbers = candidates(step, free, here.path, full, most), Counter[int]()
+        if not ways:
+            return Found(replace(best, iterate=replace(best.iterate, alternatives={})))
         keys = []
         for way in ways:  # an obstacle's ways come in the same order in each step
             numbers[way.obstacle] += 1
             keys.append((way.obstacle, numbers[way.obstacle]))
         known = {} if last is None else last.alternatives
+        about = self._present(best.nominal, free)
         old = [known.get(key) for key in keys]
-        ranked = self._rank(best, free, [way.path for way in ways], old, thorough)
+        looks = self._rank(best, about, [way.path for way in ways], old, thorough)
+        ranked = [one for one in looks if one is not None]
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
             Candidate(way.obstacle, way.normal, way.time, one.merit)
-            for way, one in zip(ways, ranked, strict=False)  # fewer where time ran out
+            for way, one in zip(ways, looks, strict=True)
+            if one is not None  # there was no time
         )
-        duals = {key: one.duals for key, one in zip(keys, ranked, strict=False)}
+        duals = {k: about.duals(one) for k, one in zip(keys, looks, strict=True) if one is not None}
         follow = self._settings.max_candidates
         if thorough:
-            ranked = self._searched(best, free, ranked, full)
+            ranked = self._searched(best, about, ranked, full)
             follow += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
         # A plan with slack is beaten by any without: then all ways are worth their time.
         for one in ranked[:follow] if safe else ranked:
-            if one.start is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
+            if one.v is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
-            if safe and same_way(step, one.passing, here):
+            if safe and same_way(step, about.passing(one), here):
                 continue  # this way leads to where we are
-            rival = self._loop.run(one.start, goal, one.about, firm=True)
+            rival = self._loop.run(about.start(one), goal, one.planes.y, firm=True)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         # None is without slack; then the one that seems to need the least is worth a try.
         first = ranked[0] if ranked and not goal.status.ok else None
-        if first is not None and first.start is not None and first.merit < goal.merit:
-            rival = self._loop.run(first.start, goal, first.about)
+        if first is not None and first.v is not None and first.merit < goal.merit:
+            rival = self._loop.run(about.start(first), goal, first.planes.y)
             if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
                 goal, switched = rival, True
         kept = replace(goal.iterate, alternatives=duals)
         return Found(replace(goal, iterate=kept), tried, switched)
 
-    def _rank(
-        self,
-        best: Result,
-        free: FloatArray,
-        paths: list[FloatArray],
-        known: list[tuple[FloatArray, FloatArray] | None],
-        thorough: bool,
-    ) -> list[Ranked]:
-        """Look at one program about each path (C, d), all linearised at once, until the deadline.
-
-        A thorough look solves it; else the multipliers after a few iterations have to do.
-        """
-        at, c, plan = self._at, self._at.layout, best.nominal
-        if not paths or plan is None:
-            return []
-        ys = np.repeat(plan.y[None], len(paths), axis=0)
-        ys[:, c.s] = at.problem.size.reference
-        ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
+    def _present(self, plan: Nominal, free: FloatArray) -> "Present":
+        """Condense about the plan that is there, with all pairs near to it or to the free one."""
+        at, c = self._at, self._at.layout
         alone = plan.y.copy()
         alone[c.p] = (free - at.step.here).ravel()
         pairs = Pairs(at.step, c, at.near(alone, at.near(plan.y, plan.pairs.near & False)))
         force = plan.pairs.table(plan.force)[pairs.obstacle, pairs.node]
-        present = replace(plan, pairs=pairs, force=force)  # where the programs' solver starts
-        condensed = at.linearise(present)
+        plan = replace(plan, pairs=pairs, force=force)
+        return Present(at, plan, at.linearise(plan))
+
+    def _rank(
+        self,
+        best: Result,
+        about: "Present",
+        paths: list[FloatArray],
+        known: list[Duals | None],
+        thorough: bool,
+    ) -> list[Ranked | None]:
+        """Look at one program about each path (C, d), all linearised at once, until the deadline.
+
+        Those come first that seem best by the multipliers of the step before: they tell soonest how
+        much the others would have to be worth. None for those for which there was no time.
+        """
+        at, c = self._at, self._at.layout
+        ys = np.repeat(about.plan.y[None], len(paths), axis=0)
+        ys[:, c.s] = at.problem.size.reference
+        ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
         give = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
-        limit, found = _HOPELESS * best.merit if best.status.ok else inf, list[Ranked]()
-        for path, about, planes, duals in zip(paths, ys, pairs.about(ys), known, strict=True):
+        limit = _HOPELESS * best.merit if best.status.ok else inf
+        only_best = best.status.ok and not thorough and self._settings.max_candidates == 1
+        programs = []
+        for planes, duals in zip(about.plan.pairs.about(ys), known, strict=True):
+            qp = at.condensed_qp(about.condensed, about.plan.pairs, planes, give)
+            force = None if duals is None else about.force(duals)
+            programs.append((-inf if force is None else qp.dual_bound(force), qp, planes, force))
+        looks: list[Ranked | None] = [None] * len(paths)
+        for k in sorted(range(len(paths)), key=lambda k: programs[k][0]):
+            bound, qp, planes, force = programs[k]
             if not at.clock.allows("candidate"):
                 break
-            one = self._look(present, condensed, planes, give, duals, limit, thorough)
-            passing = one.passing if one.start is not None else Passing(path, one.passing.touched)
-            found.append(replace(one, about=about, passing=passing))
-            if best.status.ok and not thorough and self._settings.max_candidates == 1:
+            if force is not None and bound > limit:
+                at.firm.solver.finished["cut"] += 1
+                looks[k] = Ranked(inf, planes, force)
+                continue
+            looks[k] = one = self._look(about, planes, give, qp, limit, thorough)
+            if only_best:
                 limit = min(limit, one.merit)
-        return found
+        return looks
 
     def _look(
         self,
-        present: Nominal,
-        condensed: Condensed,
+        about: "Present",
         planes: Planes,
         give: Relaxation,
-        known: tuple[FloatArray, FloatArray] | None,
+        qp: CondensedQP,
         limit: float,
         thorough: bool,
     ) -> Ranked:
-        """Look at the program with some planes, from the plan that is there."""
-        at, c, pairs = self._at, self._at.layout, present.pairs
-        hopeless = Passing(planes.y, np.zeros(pairs.near.shape, dtype=np.bool_))
-        qp = at.condensed_qp(condensed, pairs, planes, give)
-        nf = len(qp.F)
-        if known is not None and limit < inf:
-            force = np.zeros(nf + len(pairs.node))
-            force[:nf][c.inputs] = known[0].ravel()
-            force[nf:] = known[1][pairs.obstacle, pairs.node]
-            if qp.dual_bound(force) > limit:
-                at.firm.solver.finished["cut"] += 1
-                return Ranked(inf, hopeless, planes.y, None, known)
-        program = at.write(present, condensed, planes, give, qp=qp)
-        solver, start = program.subproblem.solver, at.start(program, present)
+        """Look at one program, from the plan that is there.
+
+        A thorough look solves it; else the multipliers after a few iterations have to do.
+        """
+        at, condensed = self._at, about.condensed
+        program = at.write(about.plan, condensed, planes, give, qp=qp)
+        solver, start = program.subproblem.solver, at.start(program, about.plan)
         merit, (z, y) = solver.rank(qp, program.rows, start, limit)
-        force = program.rows.forces(y)
-        exact = None
+        force, exact = program.rows.forces(y), None
         if thorough and merit < inf:
             exact = solver.solve(qp, program.rows, (z, y), at.clock).solution
             merit = inf if exact is None else qp.merit(exact.v)
         at.clock.charge("solve")
-        pushes = np.zeros((at.problem.max_obstacles, at.nodes.size))
-        pushes[pairs.obstacle, pairs.node] = force[nf:]
-        duals = force[:nf][c.inputs].reshape(c.shape), pushes
         if merit == inf:
-            return Ranked(inf, hopeless, planes.y, None, duals)
-        if exact is None:
-            away = program.subproblem.box(z) - condensed.y_free[c.boxed][: len(qp.unbox)]
-            v = qp.unbox @ away
-        else:
-            v, force = exact.v, exact.force
-        reached = condensed.y(v)
-        passing = Passing(at.path(reached)[1:], pairs.table(force[nf:]) > NEGLIGIBLE)
-        y, rollout = at.rolled(reached[c.u].reshape(c.shape), reached[c.s])
-        plan = at.nominal(y, rollout, force[:nf], pairs, force[nf:])
-        return Ranked(merit, passing, planes.y, plan, duals)
+            return Ranked(inf, planes, force)
+        if exact is not None:
+            return Ranked(merit, planes, exact.force, exact.v)
+        away = program.subproblem.box(z) - condensed.y_free[at.layout.boxed][: len(qp.unbox)]
+        return Ranked(merit, planes, force, qp.unbox @ away)
 
     def _searched(
-        self, best: Result, free: FloatArray, ranked: list[Ranked], full: FloatArray
+        self, best: Result, about: "Present", ranked: list[Ranked], full: FloatArray
     ) -> list[Ranked]:
         """Among polytopes, which face to pass at which stage is a search: the best few ways of all.
 
@@ -247,17 +249,64 @@ class MultiStart:
                 path
                 for way in beam
                 if not any(way is other for other in done)
-                for path in varied(step, way.passing, full)
+                for path in varied(step, about.passing(way), full)
             ]
             done += beam
             most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
             if not paths or not most:
                 break
             began = clock.elapsed()
-            more = self._rank(best, free, paths[:most], [None] * len(paths[:most]), True)
+            looks = self._rank(best, about, paths[:most], [None] * len(paths[:most]), True)
+            more = [one for one in looks if one is not None]
             clock.learn("candidate", began, len(more))
             beam = _best([*beam, *more])
         return beam or ranked
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """The plan that is there, about which all programs are condensed.
+
+    Attributes:
+        at: The control step in numbers.
+        plan: The plan, with the pairs that the programs hold.
+        condensed: The problem condensed about it.
+    """
+
+    at: Transcription
+    plan: Nominal
+    condensed: Condensed
+
+    def passing(self, one: Ranked) -> Passing:
+        """How the point that a program reached passes the obstacles."""
+        force = self.plan.pairs.table(one.force[self.at.layout.bounded :])
+        return Passing(self.at.path(self._reached(one))[1:], force > NEGLIGIBLE)
+
+    def start(self, one: Ranked) -> Nominal:
+        """The plan to which that point leads, with its multipliers."""
+        at, c, nf = self.at, self.at.layout, self.at.layout.bounded
+        reached = self._reached(one)
+        y, rollout = at.rolled(reached[c.u].reshape(c.shape), reached[c.s])
+        return at.nominal(y, rollout, one.force[:nf], self.plan.pairs, one.force[nf:])
+
+    def duals(self, one: Ranked) -> Duals:
+        """Multipliers of the input bounds and of all pairs, to be known in the next step."""
+        c, pairs = self.at.layout, self.plan.pairs
+        pushes = np.zeros((self.at.problem.max_obstacles, self.at.nodes.size))
+        pushes[pairs.obstacle, pairs.node] = one.force[c.bounded :]
+        return one.force[c.inputs].reshape(c.shape), pushes
+
+    def force(self, duals: Duals) -> FloatArray:
+        """Multipliers (nf + K,) from those of the step before."""
+        c, pairs = self.at.layout, self.plan.pairs
+        force = np.zeros(c.bounded + len(pairs.node))
+        force[c.inputs] = duals[0].ravel()
+        force[c.bounded :] = duals[1][pairs.obstacle, pairs.node]
+        return force
+
+    def _reached(self, one: Ranked) -> FloatArray:
+        assert one.v is not None
+        return self.condensed.y(one.v)
 
 
 def _best(ways: list[Ranked]) -> list[Ranked]:

@@ -36,41 +36,22 @@ from scp_mpc.scp.transcription import Program, Transcription
 
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
 _LESS = 1e-9  # relative fall of the merit that is none
-_STRIDE = 4.0  # steps to look ahead where they lead away; its powers if they still do
 
 
-def refined(
-    at: Transcription, program: Program, solution: QPSolution, leaps: int
-) -> tuple[QPSolution, FloatArray | None]:
-    """Go on from a convex step to Newton's, as far as its active set carries.
-
-    Args:
-        at: The control step.
-        program: The convex program.
-        solution: Its solution.
-        leaps: How often in a row the half-spaces were taken ahead of the plan.
-
-    Returns:
-        The refined solution, or the same where there is none; and, for a linear robot, the point
-        (ny,) about which to linearise next where that is not the solution.
-    """
+def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolution:
+    """Go on from a convex step to Newton's, if its active set carries that far."""
     condensed, nf = program.condensed, len(program.qp.F)
-    if not at.linear:
+    if at.linear:
+        bends, push, L = at.bends(program, solution.force[nf:])
+        if not len(push):
+            return solution
+        moved = condensed.y(solution.v) - program.planes.y
+        turned = np.einsum("kwm,kw->km", L, moved[program.pairs.at[push]])
+        whole = summed(solution, bends, turned.ravel())
+    else:
         W = at.curvature(program, solution)
         whole = newton_step(solution, solution.v - condensed.here, W)
-        return (whole if whole is not None and holds(program.qp, whole) else solution), None
-    bends, push, L = at.bends(program, solution.force[nf:])
-    if not len(push):
-        return solution, None
-    reached = condensed.y(solution.v)
-    moved = reached - program.planes.y
-    turned = np.einsum("kwm,kw->km", L, moved[program.pairs.at[push]])
-    whole = summed(solution, bends, turned.ravel())
-    if whole is not None and holds(program.qp, whole):
-        return whole, None
-    ahead = reached + _STRIDE ** (leaps + 1) * moved if whole is None else condensed.y(whole.v)
-    lower, upper = at.bounds
-    return solution, np.minimum(np.maximum(ahead, lower), upper)
+    return whole if whole is not None and holds(program.qp, whole) else solution
 
 
 def corrected(program: Program, solution: QPSolution, trial: Nominal) -> QPSolution:

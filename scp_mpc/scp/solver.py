@@ -106,7 +106,6 @@ class SCP:
         return self.solve_from(
             *(x0, x_ref, obstacles, nominal, multi_start, robot_covariance),
             u_last=u_last,
-            path=nominal is not None,
         )
 
     def solve_from(
@@ -119,12 +118,8 @@ class SCP:
         robot_covariance: ArrayLike | None = None,
         clock: Clock | None = None,
         u_last: ArrayLike | None = None,
-        path: bool = False,
     ) -> Plan:
-        """`solve`, with an iterate that is known to fit, and a clock that may run.
-
-        `path` says that its states are a path to linearise about first, wherever its inputs lead.
-        """
+        """`solve`, with an iterate that is known to fit, and a clock that may run."""
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
@@ -133,7 +128,7 @@ class SCP:
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
             )
             try:
-                return self._solve(step, clock, nominal, multi_start, path)
+                return self._solve(step, clock, nominal, multi_start)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
                 return self._plan(step, Found(self._fallback.best(step, nominal)), clock)
@@ -219,9 +214,7 @@ class SCP:
                 way[0], way, [ObstaclePrediction(m, 0.01 * np.eye(model.dim), 0.1) for m in means]
             )
 
-    def _solve(
-        self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool, path: bool
-    ) -> Plan:
+    def _solve(self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool) -> Plan:
         at = self._at
         at.begin(step, clock)
         free = self._obstacle_free(last)
@@ -233,7 +226,8 @@ class SCP:
             at.step = wide
             return self._plan(wide, Found(self._loop.result(free)), clock)
         at.free = at.iterate(free)
-        about = at.outputs(last) if path and last is not None else None
+        # Where the inputs lead from a state that a disturbance has moved says little about sides.
+        about = None if last is None else at.outputs(last)
         start = at.free if last is None else last
         for _ in range(_CORRECTIONS):
             assumed = None

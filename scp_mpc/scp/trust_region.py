@@ -47,17 +47,13 @@ class Region:
         program: Program,
         solution: QPSolution,
         refinement: QPSolution,
-        leaps: int,
     ) -> bool:
         """Whether a trial brings enough of what its program predicted."""
         at = self._at
         if not np.isfinite(trial.cost):
             return False
         if at.linear:
-            if not leaps or best is None:
-                return True
-            self._weight = at.problem.slack_weight
-            return self._merit(trial) <= self._merit(best)
+            return True
         largest = float(np.abs(solution.force[len(program.qp.F) :]).max(initial=0.0))
         self._weight = min(max(self._weight / 2, 2 * largest), at.problem.slack_weight)
         if program.give is Relaxation.EVERYBODY:
