@@ -108,6 +108,29 @@ def test_a_good_guess_needs_no_walk(bench, monkeypatch):
     bench.condenser.rolled(bench.inputs, guess)
 
 
+def test_tracking_is_the_least_costly_way_back_to_a_plan(bench):
+    """At its inputs the gradient of what tracking costs has gone, but for second order."""
+    away = 1e-4 * bench.rng.normal(size=bench.model.nx)
+    plan = rollout(bench.model.step, bench.step.x0 + away, bench.inputs).states
+    inputs, deviations = bench.condenser.tracking(plan, bench.inputs)
+
+    def cost(inputs):
+        e, push = bench.walked(inputs)[1:] - plan[1:], inputs - bench.inputs
+        weights = [bench.problem.Q] * (len(e) - 1) + [bench.problem.Qf]
+        effort = np.einsum("ni,ij,nj->", push, bench.problem.R, push)
+        return effort + sum(d @ Q @ d for d, Q in zip(e, weights, strict=True))
+
+    def slope(inputs):
+        moves = H * np.eye(inputs.size).reshape(-1, *inputs.shape)
+        return np.array([cost(inputs + move) - cost(inputs - move) for move in moves]) / (2 * H)
+
+    assert np.abs(slope(inputs)).max() < 0.01 * np.abs(slope(bench.inputs)).max()
+    there = bench.walked(inputs)[1:] - bench.step.x_ref[1:]
+    np.testing.assert_allclose(deviations, there, atol=1e-5)
+    none = bench.condenser.tracking(bench.walked(bench.inputs), bench.inputs)[0]
+    np.testing.assert_allclose(none, bench.inputs, atol=1e-9)
+
+
 def test_sensitivities_are_derivatives(bench):
     rolled = bench.condenser.rolled(bench.inputs)
     condensed = bench.condenser.condensed(rolled, bench.s)

@@ -100,6 +100,22 @@ def test_closed_loops_pass_the_obstacle_and_keep_rates(name, nodes_per_interval)
     np.testing.assert_array_equal(again[-1].U, plans[2].U)
 
 
+@pytest.mark.parametrize("name", ["unicycle", "bicycle"])
+def test_a_robot_that_is_pushed_about_goes_on_from_its_last_plan(name):
+    """Rolled out open loop, an error of the heading now would grow over the whole horizon."""
+    case = machine_problem(name, 30)
+    rng, mpc = np.random.default_rng(1), MPC(case, SETTINGS)
+    ball = obstacle(30, (12.0, 0.1), (0.1, 0.0))
+    ref, plans = straight(case.model, 30, 6.0), []
+    state = ref[0]
+    for _ in range(12):
+        plans.append(mpc.step(state + 0.05 * rng.normal(size=case.model.nx), ref, [ball]))
+        state, ref = case.model.step(state, plans[-1].u0), ref + (ref[1] - ref[0])
+    assert all(plan.status is Status.CONVERGED for plan in plans)
+    assert max(plan.iterations for plan in plans[1:]) <= 5
+    assert max(plan.cost for plan in plans) < 4.0
+
+
 def test_no_good_plan_is_forgotten_for_a_clear_one():
     """A bicycle that is pushed off its line finds back; plans' costs fall all the way."""
     case = machine_problem("bicycle", 20, nodes_per_interval=1)

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtbtrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotrs, dtbtrs, dtrtri
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
@@ -240,6 +240,30 @@ class Condenser:
         positions, between, at = self._nodes.derivatives(states, inputs)
         derivatives = Derivatives(*along, between, at)
         return Rollout(inputs, states[1:] - step.x_ref[1:], positions - step.here, derivatives)
+
+    def tracking(self, states: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inputs (N, nu) that lead from the state now back to a plan, and deviations (N, nx).
+
+        The plan is the reference of a problem without obstacles and bounds, linearised about it:
+        what a controller with feedback would do. Open loop, a small error now grows over the
+        horizon.
+
+        Args:
+            states: (N+1, nx) of the plan, whose first need not be the state now.
+            inputs: (N, nu) of the plan.
+        """
+        problem, none = self._problem, np.zeros((len(inputs), 0, states.shape[1]))
+        A, B, after = self._linearised(states, inputs)
+        along, drift = Derivatives(A, B, None, none), after - states[1:]
+        drift[0] += A[0] @ (self._step.x0 - states[0])
+        e, G = along.roll(drift), along.response
+        weighed = 2 * problem.Q @ G
+        weighed[-1] = 2 * problem.Qf @ G[-1]
+        flat, weighed = (part.reshape(-1, inputs.size) for part in (G, weighed))
+        L = _factor(flat.T @ weighed + self._effort)
+        change, _ = dpotrs(L, -(e.ravel() @ weighed), lower=1)
+        states = states[1:] + e + (flat @ change).reshape(e.shape)
+        return inputs + change.reshape(inputs.shape), states - self._step.x_ref[1:]
 
     def condensed(self, rollout: Rollout, s: FloatArray) -> Condensed:
         """Condense about a plan with sizes s (M,).

@@ -271,7 +271,7 @@ class SCP:
             elif at.linear:
                 start = at.at(known or last, at.nobody.near)
             else:
-                start = at.plain(last.inputs, last.states[1:] - at.step.x_ref[1:])
+                start = at.at(last, at.nobody.near)
                 limit = 1 if last.touches else None
                 if last.free is not None and not last.touches:
                     other = at.at(last.free, at.nobody.near)

@@ -155,8 +155,10 @@ class Transcription:
             near: (J, C) pairs to look at; None for those near to it.
             about: (ny,) another point, pairs near to which are to be looked at, too.
         """
-        guess = iterate.states[1:] - self.step.x_ref[1:]
-        y, rollout = self.rolled(iterate.inputs, iterate.s, guess)
+        inputs, guess = iterate.inputs, iterate.states[1:] - self.step.x_ref[1:]
+        if not self.linear and not np.allclose(self.step.x0, iterate.states[0]):
+            inputs, guess = self.condenser.tracking(iterate.states, inputs)
+        y, rollout = self.rolled(inputs, iterate.s, guess)
         if near is None:
             near = self.near(y, iterate.touched[: self.step.count])
             near = near if about is None else self.near(about, near)
