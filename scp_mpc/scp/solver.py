@@ -244,7 +244,10 @@ class SCP:
             if isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
             ending = clock.elapsed()
-            found = replace(found, best=self._rescued(wide, last, found.best))
+            best = self._rescued(wide, last, found.best)
+            if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
+                best = replace(best, iterate=replace(best.iterate, free=at.free))
+            found = replace(found, best=best)
             if assumed is None or self._is_kept(step, assumed, found.best):
                 break
             start, about = found.best.iterate, None
@@ -263,7 +266,7 @@ class SCP:
         sought, and one program about it has to do.
         """
         at, limit = self._at, None
-        known = last if last is None or not last.touches else last.free
+        known = last if last is None or last.free is None else last.free
         plan = at.unobstructed(known) if at.linear else None
         if plan is None:
             if last is None:
