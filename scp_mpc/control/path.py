@@ -16,7 +16,8 @@ from scp_mpc.control.curves import Pieces, circle, polyline, spline
 
 _ITERATIONS = 20  # of Newton's method for the nearest point; two or three are used
 _SMALL = 1e-4  # [m] a step after which the next would be of the order of its square
-_FLATTEST = 0.2  # least curvature of the squared distance that Newton's method divides by
+_FLAT = 1e-3  # least curvature of the squared distance that it divides by
+_FLATTEST = 0.2  # the same for where it begins
 
 
 class Path:
@@ -183,7 +184,7 @@ class Path:
             terms = _horner(powers, h)
             terms[0] -= x
             gap2, slope, bend = np.add.reduce(terms * terms[0], axis=-1)
-            after = h - slope / np.maximum(1 + bend, _FLATTEST)
+            after = h - slope / np.maximum(np.abs(1 + bend), _FLAT)
             after = np.minimum(np.maximum(after, low), high)
             moved, h = np.abs(after - h).max(), after
             if moved <= _SMALL:
