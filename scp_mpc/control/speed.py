@@ -102,6 +102,7 @@ class Schedule:
         v = np.maximum(v0 + a * tau, 0.0)
         s_at = start + self.s[at] + (v0 + 0.5 * a * tau) * tau
         if not path.closed:
+            over |= s_at >= path.length  # by rounding
             s_at[over], v[over] = path.length, 0.0
         return s_at, v
 
