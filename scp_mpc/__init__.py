@@ -25,17 +25,8 @@ from scp_mpc.errors import (
     StaleDataError,
     TooManyObstaclesError,
 )
-from scp_mpc.obstacles import (
-    CircularObstacle,
-    ConstantVelocityPredictor,
-    ObstaclePrediction,
-    Polytope,
-    ReportPredictor,
-    Tracker,
-    TrackerSettings,
-)
-from scp_mpc.problem import Problem
-from scp_mpc.robots import (
+from scp_mpc.geometry import Containment, JointRisk, Margin, StageRisk
+from scp_mpc.models import (
     ContinuousModel,
     Disturbed,
     DoubleIntegrator,
@@ -48,9 +39,17 @@ from scp_mpc.robots import (
     Unicycle,
     lqr_weight,
 )
-from scp_mpc.safety import Containment, JointRisk, Margin, StageRisk
+from scp_mpc.obstacles import (
+    CircularObstacle,
+    ConstantVelocityPredictor,
+    ObstaclePrediction,
+    Polytope,
+    ReportPredictor,
+)
+from scp_mpc.problem import Problem
 from scp_mpc.scp import SCP, Iterate, Plan, Status
 from scp_mpc.settings import Freshness, QPSettings, Settings
+from scp_mpc.tracking import Tracker, TrackerSettings
 from scp_mpc.trajectory import Trajectory
 
 __version__ = version("scp-mpc")

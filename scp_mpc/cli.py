@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal, cast
 from scp_mpc import Containment, Margin, ScpMpcError, Settings, __version__
 from scp_mpc.arrays import as_count
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.obstacles import TrackerSettings
 from scp_mpc.problem import Problem
 from scp_mpc.report import (
     COLUMNS,
@@ -41,6 +40,7 @@ from scp_mpc.simulation import (
     simulate,
 )
 from scp_mpc.simulation import replay as run_replay
+from scp_mpc.tracking import TrackerSettings
 
 try:
     import typer

@@ -41,10 +41,10 @@ from scp_mpc.arrays import (
     frozen,
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
-from scp_mpc.robots.model import Model
-from scp_mpc.robots.riccati import terminal_weight
-from scp_mpc.safety.inflation import AxesInflation, ExactInflation, Inflation
-from scp_mpc.safety.margin import Containment, Margin, Promise, size_at
+from scp_mpc.geometry.inflation import AxesInflation, ExactInflation, Inflation
+from scp_mpc.geometry.margin import Containment, Margin, Promise, size_at
+from scp_mpc.models.model import Model
+from scp_mpc.models.riccati import terminal_weight
 from scp_mpc.settings import require_positive
 
 ROUNDING = 1e-9  # [unit of the input] by which a rate may exceed its bounds

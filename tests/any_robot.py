@@ -10,8 +10,8 @@ import numpy as np
 from judge import exact_distances
 
 from scp_mpc import DoubleIntegrator, JointRisk, Margin, ObstaclePrediction, Problem
+from scp_mpc.models import FunctionModel, KinematicBicycle, PlanarQuadrotor, Quadrotor, Unicycle
 from scp_mpc.obstacles import Polytope
-from scp_mpc.robots import FunctionModel, KinematicBicycle, PlanarQuadrotor, Quadrotor, Unicycle
 
 DT = 0.2
 _FINE = 24

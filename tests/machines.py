@@ -6,7 +6,7 @@ import numpy as np
 from instances import rotated
 
 from scp_mpc import Margin, ObstaclePrediction, Problem
-from scp_mpc.robots import (
+from scp_mpc.models import (
     FunctionModel,
     KinematicBicycle,
     Model,

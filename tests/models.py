@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scp_mpc.robots import (
+from scp_mpc.models import (
     DoubleIntegrator,
     FunctionModel,
     KinematicBicycle,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import rollout

@@ -6,7 +6,7 @@ import numpy as np
 import qpsolvers
 from scipy import sparse
 
-from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.geometry.no_go import NoGoSets
 
 TIGHT = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},

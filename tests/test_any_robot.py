@@ -9,7 +9,7 @@ import pytest
 from any_robot import DT, ROBOTS, complaints, scene, start, world
 
 from scp_mpc import MPC, SCP, ObstaclePrediction, Problem, Settings
-from scp_mpc.robots import KinematicBicycle, Unicycle
+from scp_mpc.models import KinematicBicycle, Unicycle
 from scp_mpc.scp import Iterate, KKTResiduals, Multipliers, Status
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.nodes import Nodes

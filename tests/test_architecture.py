@@ -10,12 +10,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "scp_mpc"
 FLOORS = [
     {"errors", "arrays", "deadline", "provenance", "trajectory"},
-    {"robots", "obstacles", "settings"},
-    {"safety"},
+    {"models", "obstacles", "settings"},
+    {"geometry"},
     {"problem"},
     {"qp"},
     {"scp"},
-    {"control"},
+    {"control", "tracking"},
     {"simulation"},
     {"comparison"},
     {"report"},

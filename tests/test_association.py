@@ -5,8 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from scp_mpc.obstacles.association import associate
-from scp_mpc.obstacles.kalman import Gaussians
+from scp_mpc.tracking.association import associate
+from scp_mpc.tracking.kalman import Gaussians
 
 GATE = 9.21
 

@@ -15,8 +15,8 @@ from solving import half_spaces
 
 from scp_mpc import MPC, SCP, QPSettings, Settings, Status, Trajectory
 from scp_mpc.deadline import Clock
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.qp.active_set import QPSolution
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp import transcription
 from scp_mpc.scp.certificate import least_curvature
 from scp_mpc.scp.layout import Layout

@@ -5,9 +5,9 @@ import pytest
 from recordings import street
 
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.obstacles import WALKING, Motion, Tracker, TrackerSettings
 from scp_mpc.report import coverage_numbers, coverage_table
 from scp_mpc.simulation import Recording, measure_coverage
+from scp_mpc.tracking import WALKING, Motion, Tracker, TrackerSettings
 
 
 def walkers(motion, people=120, frames=20, seed=4):

@@ -18,7 +18,7 @@ from scp_mpc import (
 )
 from scp_mpc.control import DisturbanceEstimator, Regulator, WindAwareMPC, disturbed
 from scp_mpc.control.spread import PositionSpread
-from scp_mpc.robots import Disturbed
+from scp_mpc.models import Disturbed
 from scp_mpc.simulation import SCENARIOS, ConstantPush, simulate
 
 VELOCITIES = [1, 3]

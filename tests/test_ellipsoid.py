@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scp_mpc.safety import signed_distance
+from scp_mpc.geometry import signed_distance
 
 coordinate = st.floats(-10, 10).map(lambda v: 0.0 if abs(v) < 1e-6 else v)
 axis = st.floats(0, 5).map(lambda v: 0.0 if v < 1e-6 else v)

@@ -13,7 +13,7 @@ from scp_mpc import (
     ShapeError,
 )
 from scp_mpc.control import DisturbanceEstimator
-from scp_mpc.robots import Disturbed
+from scp_mpc.models import Disturbed
 
 POSITION = [[1, 0, 0, 0], [0, 0, 1, 0]]
 

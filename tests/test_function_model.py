@@ -11,7 +11,7 @@ from scp_mpc.errors import (
     NotFiniteError,
     ShapeError,
 )
-from scp_mpc.robots import (
+from scp_mpc.models import (
     FunctionModel,
     KinematicBicycle,
     LinearModel,

@@ -5,10 +5,10 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from scp_mpc.obstacles import Motion
-from scp_mpc.obstacles.foresight import Foresight
-from scp_mpc.obstacles.imm import Beliefs, MotionBank
-from scp_mpc.obstacles.kalman import Gaussians
+from scp_mpc.tracking import Motion
+from scp_mpc.tracking.imm import Beliefs, MotionBank
+from scp_mpc.tracking.kalman import Gaussians
+from scp_mpc.tracking.prediction import HorizonPredictor
 
 MOTIONS = (Motion(0.05), Motion(0.4, weight=0.3), Motion(0.1, 0.6, weight=0.2))
 NOISE = 0.1**2 * np.eye(2)
@@ -75,7 +75,7 @@ def test_prediction_is_exact_over_all_histories():
     """Mean and covariance after four steps, from every one of the 3^5 sequences of motions."""
     bank, steps, dt = MotionBank(MOTIONS, 1.0, 2), 4, 0.3
     b = beliefs(1, 3)
-    means, covariances = Foresight(bank, steps, dt).positions(b)
+    means, covariances = HorizonPredictor(bank, steps, dt).positions(b)
     F, Q, Pi = bank.transition(dt)
     weights, ends, spreads = [], [], []
     for history in product(range(3), repeat=steps + 1):
@@ -94,7 +94,7 @@ def test_prediction_is_exact_over_all_histories():
 def test_foresight_is_the_bank_stage_by_stage(dim):
     motions = MOTIONS if dim == 2 else MOTIONS[:2]
     bank, b = MotionBank(motions, 1.0, dim), beliefs(5, len(motions), dim=dim)
-    means, covariances = Foresight(bank, 12, 0.2).positions(b)
+    means, covariances = HorizonPredictor(bank, 12, 0.2).positions(b)
     assert means.shape == (5, 13, dim)
     for i in range(13):
         mean, cov = b.moments()

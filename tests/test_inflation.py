@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from instances import S_REF, obstacle, rotated
 
 from scp_mpc import ObstaclePrediction
-from scp_mpc.safety import AxesInflation, ExactInflation, NoGoSets
+from scp_mpc.geometry import AxesInflation, ExactInflation, NoGoSets
 
 STAGES = 6
 INFLATIONS = {"exact": ExactInflation(S_REF), "axes": AxesInflation(S_REF)}

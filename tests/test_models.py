@@ -8,8 +8,8 @@ from models import DT, MODELS, OWN, draw, unicycle_rates
 from scipy.integrate import solve_ivp
 from scipy.special import spherical_jn
 
-from scp_mpc.robots import KinematicBicycle, Model, PlanarQuadrotor, Quadrotor, Unicycle
-from scp_mpc.robots.bessel import bessel, bessel_pair
+from scp_mpc.models import KinematicBicycle, Model, PlanarQuadrotor, Quadrotor, Unicycle
+from scp_mpc.models.bessel import bessel, bessel_pair
 
 every = pytest.mark.parametrize("name", MODELS)
 seeds = st.integers(0, 2**32 - 1)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from scp_mpc.errors import BoundsError, NotFiniteError
-from scp_mpc.obstacles import Motion
+from scp_mpc.tracking import Motion
 
 
 def generator(omega, dim=2):

@@ -17,7 +17,7 @@ from scp_mpc import (
     Status,
 )
 from scp_mpc.errors import InvalidArgumentError
-from scp_mpc.robots import FunctionModel
+from scp_mpc.models import FunctionModel
 from scp_mpc.scp.nodes import LinearNodes
 from scp_mpc.scp.trust_region import Region
 from scp_mpc.trajectory import rollout

@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 
 from scp_mpc.errors import BoundsError, GeometryError, NotFiniteError, ShapeError
+from scp_mpc.geometry.polytopes import Polytopes
 from scp_mpc.obstacles import Polytope
-from scp_mpc.safety.polytopes import Polytopes
 
 seeds = st.integers(0, 2**32 - 1)
 some = settings(max_examples=30)

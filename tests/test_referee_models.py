@@ -11,7 +11,7 @@ from referee import Referee
 from referee_models import ModelReferee, symbolic
 
 from scp_mpc import SCP, Containment, DoubleIntegrator, ObstaclePrediction, Problem, Settings
-from scp_mpc.robots import Unicycle
+from scp_mpc.models import Unicycle
 from scp_mpc.trajectory import rollout
 
 

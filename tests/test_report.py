@@ -12,6 +12,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from scp_mpc import InvalidArgumentError, ObstaclePrediction, Settings, Status
+from scp_mpc.geometry import NoGoSets
 from scp_mpc.report import (
     COLUMNS,
     FIGURES,
@@ -32,7 +33,6 @@ from scp_mpc.report.time_series import (
     velocity_figure,
 )
 from scp_mpc.report.trajectory import trajectory_figure
-from scp_mpc.safety import NoGoSets
 from scp_mpc.simulation import SCENARIOS, simulate
 
 STEPS = 12

@@ -16,7 +16,7 @@ from scp_mpc import (
     ShapeError,
 )
 from scp_mpc.control.preview import Preview
-from scp_mpc.robots.riccati import lqr_gain, lqr_weight, terminal_weight
+from scp_mpc.models.riccati import lqr_gain, lqr_weight, terminal_weight
 
 FREE = {"u_min": -1e6, "u_max": 1e6, "max_obstacles": 0}
 PATHS = [Settings(), Settings(solver="piqp")]

@@ -19,8 +19,8 @@ from scp_mpc import (
     ObstaclePrediction,
     StageRisk,
 )
-from scp_mpc.safety import NoGoSets, containment_size, risk_bound, size_at_risk
-from scp_mpc.safety.allocation import reallocated
+from scp_mpc.geometry import NoGoSets, containment_size, risk_bound, size_at_risk
+from scp_mpc.scp.risk_allocation import reallocated
 
 S95 = 5.991**0.5
 

@@ -18,8 +18,8 @@ from scp_mpc import (
     StageRisk,
     Status,
 )
+from scp_mpc.geometry import AxesInflation, ExactInflation, NoGoSets, risk_bound
 from scp_mpc.obstacles import Polytope, aged
-from scp_mpc.safety import AxesInflation, ExactInflation, NoGoSets, risk_bound
 from scp_mpc.scp.step import Step
 
 N = 5

@@ -12,7 +12,7 @@ from scp_mpc.errors import (
     ShapeError,
     StaleDataError,
 )
-from scp_mpc.obstacles import WALKING_AND_TURNING, Motion, Tracker, TrackerSettings
+from scp_mpc.tracking import WALKING_AND_TURNING, Motion, Tracker, TrackerSettings
 
 CERTAIN = TrackerSettings(confirm=1)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from scp_mpc.obstacles import Motion, Tracker, TrackerSettings
-from scp_mpc.obstacles.kalman import mahalanobis
+from scp_mpc.tracking import Motion, Tracker, TrackerSettings
+from scp_mpc.tracking.kalman import mahalanobis
 
 PEOPLE, STD, DT, LEADS = 400, 0.05, 0.4, 12
 CV = TrackerSettings(motions=(Motion(0.05),), speed=1.0)

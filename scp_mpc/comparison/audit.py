@@ -15,9 +15,9 @@ from scipy.stats import norm
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.nlp import linear_model, require_round
+from scp_mpc.geometry.margin import JointRisk, StageRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.margin import JointRisk, StageRisk
 from scp_mpc.scp.plan import Plan
 
 _TOLERANCE = 1e-6  # [m], that of the settings

@@ -1,6 +1,6 @@
 """IPOPT, an interior-point method, on the original problem with exact derivatives.
 
-Notation: as in `nlp.py` and `scp_mpc.safety.no_go`; y = R'(p - mu), m = [cos theta, sin theta].
+Notation: as in `nlp.py` and `scp_mpc.geometry.no_go`; y = R'(p - mu), m = [cos theta, sin theta].
 
     axes    |y / (s sigma + r)|^2 >= 1, the square form of (14)
     exact   m'y - s |diag(sigma) m| >= r, with the angle theta_{j,i} as one more unknown
@@ -21,10 +21,10 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.nlp import Unknowns, linear_model, read
 from scp_mpc.comparison.peer_plan import PeerMissingError, PeerPlan
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.geometry.ellipsoid import signed_distance
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.ellipsoid import signed_distance
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory

@@ -7,7 +7,7 @@ Notation:
     subject to x_{i+1} - A x_i - B u_i = 0,  g_{j,i}(z) >= 0,  lower <= z <= upper
 
 For the report's "axes" g is the left side of (14) less 1, its square form as printed:
-|R'(p - mu) / (s sigma + r)|^2 - 1. For "exact" it is the signed distance of `scp_mpc.safety`,
+|R'(p - mu) / (s sigma + r)|^2 - 1. For "exact" it is the signed distance of `scp_mpc.geometry`,
 which each peer writes in the way that suits it.
 """
 
@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.geometry.no_go import NoGoSets
+from scp_mpc.models.linear import LinearModel, as_linear
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel, as_linear
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.step import Step
 

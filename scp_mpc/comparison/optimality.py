@@ -14,7 +14,7 @@ from scp_mpc.comparison.attempts import TOLERATED
 from scp_mpc.comparison.ipopt import Ipopt
 from scp_mpc.comparison.progress import progress
 from scp_mpc.control.mpc import MPC
-from scp_mpc.safety.margin import Margin
+from scp_mpc.geometry.margin import Margin
 from scp_mpc.scp.solver import SCP
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 from scp_mpc.trajectory import Trajectory

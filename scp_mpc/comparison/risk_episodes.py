@@ -19,9 +19,9 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.risk_scenes import DT, rotated
 from scp_mpc.comparison.risk_settings import RiskSetting, problem_for
 from scp_mpc.control.mpc import MPC
+from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor
 from scp_mpc.problem import Problem
-from scp_mpc.robots.double_integrator import DoubleIntegrator
 from scp_mpc.simulation.contact import contacts, robot_path
 
 HORIZON = 8

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor, ReportPredictor
-from scp_mpc.robots.double_integrator import DoubleIntegrator
 
 HORIZON = 15
 DT = 0.2  # [s]

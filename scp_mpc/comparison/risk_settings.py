@@ -20,9 +20,9 @@ from scipy.stats import chi2, norm
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
+from scp_mpc.geometry.margin import Containment, JointRisk, Margin, Promise, StageRisk
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
-from scp_mpc.safety.margin import Containment, JointRisk, Margin, Promise, StageRisk
 from scp_mpc.settings import require_positive
 
 DELTAS = (0.1, 0.05, 0.01)

@@ -7,9 +7,9 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
+from scp_mpc.models.linear import LinearModel, as_linear
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel, as_linear
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.solver import SCP
 from scp_mpc.settings import Settings

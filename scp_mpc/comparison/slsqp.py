@@ -16,9 +16,9 @@ from scipy.optimize import Bounds, minimize
 from scp_mpc.arrays import FloatArray
 from scp_mpc.comparison.nlp import Unknowns, linear_model, read
 from scp_mpc.comparison.peer_plan import PeerPlan
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import Trajectory

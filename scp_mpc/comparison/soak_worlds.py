@@ -8,10 +8,10 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import NotFiniteError, ScpMpcError, ShapeError, TooManyObstaclesError
+from scp_mpc.geometry.margin import JointRisk, Margin, StageRisk
+from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.double_integrator import DoubleIntegrator
-from scp_mpc.safety.margin import JointRisk, Margin, StageRisk
 from scp_mpc.settings import Settings
 
 SLOTS = 6

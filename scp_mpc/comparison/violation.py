@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.no_go import NoGoSets
 
 
 def largest_violation(
@@ -22,7 +22,7 @@ def largest_violation(
 
     It is the largest, each in its own unit, of |x_0 - x0|, the defects |x_{i+1} - f(x_i, u_i)|,
     what states, inputs, rates between intervals and sizes exceed their bounds by, and the depth [m]
-    inside a no-go set at the plan's own s: -g of `scp_mpc.safety.inflation`.
+    inside a no-go set at the plan's own s: -g of `scp_mpc.geometry.inflation`.
 
     Args:
         problem: Whose constraints.

@@ -21,9 +21,9 @@ from scp_mpc.control.mpc import MPC
 from scp_mpc.control.regulator import Regulator
 from scp_mpc.control.spread import Foresight
 from scp_mpc.control.wind_aware import WindAwareMPC
+from scp_mpc.models.disturbed import Disturbed
+from scp_mpc.models.linear import as_linear
 from scp_mpc.problem import Problem
-from scp_mpc.robots.disturbed import Disturbed
-from scp_mpc.robots.linear import as_linear
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.closed_loop import ClosedLoop, Controller, simulate
 from scp_mpc.simulation.disturbance import ConstantPush, CorrelatedDisturbance, Disturbance

@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_discrete_are
 
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.robots.disturbed import Disturbed
+from scp_mpc.models.disturbed import Disturbed
 
 _FINEST = 1e-6  # a measurement's standard deviation, so that T can be inverted
 

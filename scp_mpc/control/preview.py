@@ -4,7 +4,7 @@ With the Riccati equation's terminal weight, a plan of N stages is the beginning
 without end, where no constraint is active beyond stage N and the reference goes on by itself
 (constant velocity). A reference that needs inputs, as a circle does, makes the cost to go
 affine; moving the reference's last row by a linear function of the later ones accounts for that
-exactly (`scp_mpc.robots.riccati`).
+exactly (`scp_mpc.models.riccati`).
 
 Notation:
     N, L    horizon, rows beyond it
@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, as_array, as_count
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.models.linear import LinearModel
+from scp_mpc.models.riccati import lqr_preview
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
-from scp_mpc.robots.riccati import lqr_preview
 
 
 class Preview:

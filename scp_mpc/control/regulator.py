@@ -17,8 +17,8 @@ from scipy.linalg import solve_discrete_are
 
 from scp_mpc.arrays import FloatArray, as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
+from scp_mpc.models.disturbed import Disturbed
 from scp_mpc.problem import Problem
-from scp_mpc.robots.disturbed import Disturbed
 
 
 class Regulator:

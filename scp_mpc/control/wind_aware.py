@@ -18,10 +18,10 @@ from scp_mpc.control.mpc import MPC
 from scp_mpc.control.regulator import Regulator
 from scp_mpc.control.spread import Foresight, PositionSpread
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
+from scp_mpc.models.disturbed import Disturbed
+from scp_mpc.models.linear import as_linear
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.disturbed import Disturbed
-from scp_mpc.robots.linear import as_linear
 from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 

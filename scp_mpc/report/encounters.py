@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray
-from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.simulation.closed_loop import ClosedLoop
 
 

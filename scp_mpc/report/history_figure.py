@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.report.canvas import (
     HALF_PLANE,
     LIMIT,
@@ -25,7 +26,6 @@ from scp_mpc.report.canvas import (
     tidy,
 )
 from scp_mpc.report.outline import outline
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.history import Record
 from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings

@@ -9,10 +9,10 @@ Notation, in the frame of the ellipse's axes:
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.solid import Solid
 from scp_mpc.problem import Problem
-from scp_mpc.safety.no_go import NoGoSets
 
 _POINTS = 361
 

@@ -10,9 +10,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle, Polygon
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.report.canvas import HALF_PLANE, OBSTACLE, PLAN, REFERENCE, ROBOT
 from scp_mpc.report.outline import no_go_outline
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.simulation.closed_loop import ClosedLoop
 
 _FADING = (1.0, 0.7, 0.5, 0.35, 0.2)  # opacity of the no-go sets along the horizon

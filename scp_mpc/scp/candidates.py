@@ -26,7 +26,7 @@ from itertools import chain, islice, product
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
-from scp_mpc.safety.polytopes import Polytopes
+from scp_mpc.geometry.polytopes import Polytopes
 from scp_mpc.scp.step import Step
 
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles

@@ -29,8 +29,8 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtbtrs, dtrtri
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step

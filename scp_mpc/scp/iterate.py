@@ -14,8 +14,8 @@ import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, require_finite
 from scp_mpc.errors import InvalidArgumentError, ShapeError
+from scp_mpc.models.model import Model
 from scp_mpc.problem import Problem
-from scp_mpc.robots.model import Model
 from scp_mpc.trajectory import Trajectory
 
 NEGLIGIBLE = 1e-6  # [cost / m, or per unit of input]; interior points leave none exactly zero

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.models.linear import LinearModel
+from scp_mpc.models.model import Model
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import LinearModel
-from scp_mpc.robots.model import Model
 
 _RESERVE = 1.2  # of what is assumed about a plan over what is known of the one before
 

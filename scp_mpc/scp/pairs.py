@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray
-from scp_mpc.safety.halfspaces import HalfSpaces
-from scp_mpc.safety.no_go import NoGoSets
+from scp_mpc.geometry.no_go import HalfSpaces, NoGoSets
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.step import Step
 

@@ -24,11 +24,10 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, frozen
 from scp_mpc.deadline import Clock, Pace
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
+from scp_mpc.geometry.margin import JointRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import QuadraticProgram
-from scp_mpc.safety.margin import JointRisk
-from scp_mpc.scp.allocate import allocate
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.iterate import Iterate, as_iterate
@@ -36,6 +35,7 @@ from scp_mpc.scp.loop import Loop
 from scp_mpc.scp.multi_start import Found, MultiStart
 from scp_mpc.scp.nodes import Motion, Nodes
 from scp_mpc.scp.plan import Plan, Result, Status, Timing
+from scp_mpc.scp.risk_allocation import allocate
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Relaxation, Transcription
 from scp_mpc.settings import Settings

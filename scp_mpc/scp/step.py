@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import BoolArray, FloatArray, as_array, require_positive_semidefinite
 from scp_mpc.errors import ShapeError, TooManyObstaclesError
+from scp_mpc.geometry.margin import Margin
+from scp_mpc.geometry.no_go import NoGoSets
+from scp_mpc.geometry.polytopes import Polytopes
+from scp_mpc.geometry.risk import risk_bound
 from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.problem import Problem
-from scp_mpc.safety.margin import Margin
-from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.safety.polytopes import Polytopes
-from scp_mpc.safety.risk import risk_bound
 from scp_mpc.scp.nodes import Nodes
 
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by

@@ -25,11 +25,11 @@ import numpy as np
 from scipy import sparse
 
 from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.problem import Problem
 from scp_mpc.qp.backend import ProgramSolver, Rows
 from scp_mpc.qp.program import QuadraticProgram
 from scp_mpc.qp.sparse_blocks import SparseBlocks
-from scp_mpc.robots.linear import LinearModel
 from scp_mpc.scp.condensing import Derivatives, Rollout
 from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes

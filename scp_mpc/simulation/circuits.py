@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.models.bicycle import KinematicBicycle
+from scp_mpc.models.double_integrator import DoubleIntegrator
+from scp_mpc.models.planar_quadrotor import PlanarQuadrotor
+from scp_mpc.models.quadrotor import Quadrotor
+from scp_mpc.models.unicycle import Unicycle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.bicycle import KinematicBicycle
-from scp_mpc.robots.double_integrator import DoubleIntegrator
-from scp_mpc.robots.planar_quadrotor import PlanarQuadrotor
-from scp_mpc.robots.quadrotor import Quadrotor
-from scp_mpc.robots.unicycle import Unicycle
 
 _R, _OMEGA = 8.0, 0.52  # the report's reference
 _BODY = 0.15  # [m] radius of the robot

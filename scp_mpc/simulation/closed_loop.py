@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
+from scp_mpc.geometry.no_go import NoGoSets
+from scp_mpc.models.linear import as_linear
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.linear import as_linear
-from scp_mpc.safety.no_go import NoGoSets
 from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.disturbance import Push

@@ -27,8 +27,8 @@ import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, as_array, as_number
 from scp_mpc.errors import BoundsError, ShapeError
-from scp_mpc.robots.linear import LinearModel
-from scp_mpc.robots.model import Model
+from scp_mpc.models.linear import LinearModel
+from scp_mpc.models.model import Model
 
 FINE = 32  # pieces of an interval; at 3 m/s^2 and 0.2 s they are within 0.02 mm of the curve
 _CHUNK = 8192  # paths at once: temporaries stay within the processor's caches

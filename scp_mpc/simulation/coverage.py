@@ -23,11 +23,10 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray, as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.obstacles.kalman import mahalanobis
-from scp_mpc.obstacles.tracker import Tracker
-from scp_mpc.obstacles.tracker_settings import TrackerSettings
 from scp_mpc.settings import require_positive
 from scp_mpc.simulation.recording import Recording, along
+from scp_mpc.tracking.kalman import mahalanobis
+from scp_mpc.tracking.tracker import Tracker, TrackerSettings
 
 LEVELS = (0.5, 0.9, 0.95)
 _LONGEST = 4.8  # [s]

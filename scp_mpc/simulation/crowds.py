@@ -7,10 +7,10 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
+from scp_mpc.geometry.margin import Promise
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.safety.margin import Promise
 from scp_mpc.simulation.scenarios import DT, Scenario
 
 _TRACKS = (8.0, 6.6, 9.4, 5.2, 10.8)  # [m] on the reference circle, inside it, outside it

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_array
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 
 Push = Callable[[FloatArray], FloatArray]
 

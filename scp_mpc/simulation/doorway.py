@@ -11,15 +11,14 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.path import Path
 from scp_mpc.control.path_reference import PathReference
 from scp_mpc.control.speed import SpeedLimits
+from scp_mpc.geometry.margin import StageRisk
+from scp_mpc.models.unicycle import Unicycle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.shape import Polytope
-from scp_mpc.obstacles.tracker import Tracker
-from scp_mpc.obstacles.tracker_settings import TrackerSettings
 from scp_mpc.problem import Problem
-from scp_mpc.robots.unicycle import Unicycle
-from scp_mpc.safety.margin import StageRisk
 from scp_mpc.settings import require_positive
 from scp_mpc.simulation.drive import Look
+from scp_mpc.tracking.tracker import Tracker, TrackerSettings
 
 ROOM = ((0.0, 12.0), (0.0, 7.0))  # [m] from where to where it reaches along both axes
 _WALL = (6.0, 6.3)  # [m] along x

@@ -17,10 +17,10 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
+from scp_mpc.geometry.polytopes import Polytopes
+from scp_mpc.models.model import Model
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.model import Model
-from scp_mpc.safety.polytopes import Polytopes
 from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.contact import FINE

@@ -7,10 +7,10 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.path import Path
 from scp_mpc.control.path_reference import PathReference
+from scp_mpc.geometry.margin import Containment
+from scp_mpc.models.quadrotor import Quadrotor
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.robots.quadrotor import Quadrotor
-from scp_mpc.safety.margin import Containment
 from scp_mpc.simulation.drive import Look
 
 _LEAN = 0.7  # [rad] of roll and pitch at most

@@ -25,7 +25,7 @@ from scipy.linalg import cholesky, expm, solve_continuous_lyapunov
 
 from scp_mpc.arrays import FloatArray, as_array, as_number, frozen
 from scp_mpc.errors import BoundsError, ShapeError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.simulation.disturbance import Push
 
 _FOOT = 0.3048  # [m]

@@ -13,7 +13,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_number
 from scp_mpc.errors import BoundsError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.simulation.disturbance import Push
 
 

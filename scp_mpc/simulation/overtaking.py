@@ -11,10 +11,10 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.path import Path
 from scp_mpc.control.path_reference import PathReference
+from scp_mpc.models.bicycle import KinematicBicycle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.shape import Polytope
 from scp_mpc.problem import Problem
-from scp_mpc.robots.bicycle import KinematicBicycle
 from scp_mpc.simulation.drive import Look
 
 LANE = 3.6  # [m] wide; the left one is at x = -LANE

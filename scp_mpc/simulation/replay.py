@@ -13,16 +13,15 @@ import numpy as np
 from scp_mpc.arrays import FloatArray, as_count
 from scp_mpc.control.mpc import MPC
 from scp_mpc.errors import BoundsError, InvalidArgumentError
+from scp_mpc.geometry.margin import Containment, Promise
+from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.obstacles.tracker import Tracker
-from scp_mpc.obstacles.tracker_settings import TrackerSettings
 from scp_mpc.problem import Problem
-from scp_mpc.robots.double_integrator import DoubleIntegrator
-from scp_mpc.safety.margin import Containment, Promise
 from scp_mpc.scp.plan import Status
 from scp_mpc.settings import Freshness, Settings, require_positive
 from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
+from scp_mpc.tracking.tracker import Tracker, TrackerSettings
 
 DT = 0.2  # [s]
 TRACKING = TrackerSettings(confirm=1)  # with names nothing is a false alarm: tell of it at once

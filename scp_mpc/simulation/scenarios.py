@@ -7,12 +7,12 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
+from scp_mpc.geometry.margin import Promise
+from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import Predictor, ReportPredictor
 from scp_mpc.problem import Problem
-from scp_mpc.robots.double_integrator import DoubleIntegrator
-from scp_mpc.safety.margin import Promise
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance, Disturbance
 
 DT = 0.2  # [s]

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_count, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.robots.coasting import coasting_brake, coasting_state
-from scp_mpc.robots.model import Linearisation, Model, as_period, as_places, differences, joined
-from scp_mpc.robots.runge_kutta import ContinuousModel
+from scp_mpc.models.coasting import coasting_brake, coasting_state
+from scp_mpc.models.model import Linearisation, Model, as_period, as_places, differences, joined
+from scp_mpc.models.runge_kutta import ContinuousModel
 
 Function = Callable[[FloatArray, FloatArray], Any]
 _COMPLEX_STEP = 1e-30

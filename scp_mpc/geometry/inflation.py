@@ -7,22 +7,31 @@ Notation:
     g       (M, N)      constraint function: outside the no-go set means g(p, s) >= 0 [m]
 
 Other symbols as in `no_go.py`. Both inflations return g together with its linearisation. For
-obstacles that are polytopes there is only one, that of `walls.py`.
+obstacles that are polytopes there is only one, whatever the inflation of the others,
+
+    g(p, s) = sd(p - mu) - s sigma - r,     sigma^2 the largest eigenvalue of Sigma,
+
+the distance to polytope (+) ball(s sigma + r): jointly convex in (p, s), so that
+
+    n'(p - mu) - h(n) - s sigma >= r
+
+lies inside the true feasible set for every unit n, h as in `polytopes.py`. The obstacle touches
+only if n'(p - o) - h(n) <= r, and n'o has a standard deviation of sigma at most: so
+s = Phi^-1(1 - delta) bounds the probability of a collision by delta here, too.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.safety.ellipsoid import signed_distance
-from scp_mpc.safety.halfspaces import HalfSpaces
-from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.safety.tangents import inverse_root, tangents
-from scp_mpc.safety.walls import clearance as wall_clearance
-from scp_mpc.safety.walls import linearise as linearise_walls
+from scp_mpc.geometry.ellipsoid import signed_distance
+from scp_mpc.geometry.no_go import HalfSpaces, NoGoSets
+from scp_mpc.geometry.polytopes import Polytopes
+from scp_mpc.geometry.tangents import inverse_root, tangents
 
 _POINT = 1e-9  # [m] a semi-axis below this is that of a point
 
@@ -258,3 +267,32 @@ def _masked(
         np.where(on, offset, -np.inf),
         np.where(on, value, np.inf),
     )
+
+
+def linearise_walls(
+    sets: NoGoSets, positions: FloatArray, s: FloatArray, side: Callable[[], FloatArray]
+) -> HalfSpaces:
+    """Linearise g about positions (M, N, d) and s (M,); see `Inflation.linearise`."""
+    y = positions - sets.means
+    near = _shapes(sets).nearest(y, side)
+    sigma = largest(sets)
+    value = near.distance - s[:, None] * sigma - sets.radii
+    offset = np.add.reduce(near.normal * positions, axis=-1) - near.distance + sets.radii
+    return HalfSpaces(near.normal, -sigma, offset, value, near.bend)
+
+
+def wall_clearance(sets: NoGoSets, positions: FloatArray, s: float) -> FloatArray:
+    """G (M, N) at positions (M, N, d) and one size for all."""
+    distance = _shapes(sets).distance(positions - sets.means)
+    return distance - s * largest(sets) - sets.radii
+
+
+def largest(sets: NoGoSets) -> FloatArray:
+    """Largest standard deviations sigma (M, N) [m]."""
+    sigma: FloatArray = sets.deviations.max(axis=-1)
+    return sigma
+
+
+def _shapes(sets: NoGoSets) -> Polytopes:
+    assert sets.shapes is not None
+    return sets.shapes

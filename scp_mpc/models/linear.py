@@ -16,7 +16,7 @@ from scipy.linalg import fractional_matrix_power
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.robots.model import Linearisation, Model, as_period, as_places
+from scp_mpc.models.model import Linearisation, Model, as_period, as_places
 
 _MOST_POWERS = 64
 

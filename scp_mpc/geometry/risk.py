@@ -17,9 +17,9 @@ import numpy as np
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.safety.ellipsoid import signed_distance
-from scp_mpc.safety.no_go import NoGoSets
-from scp_mpc.safety.walls import clearance, largest
+from scp_mpc.geometry.ellipsoid import signed_distance
+from scp_mpc.geometry.inflation import largest, wall_clearance
+from scp_mpc.geometry.no_go import NoGoSets
 
 LEAST_RISK = 1e-12  # smaller risks are not told apart: s stays below 7.04
 _NEWTON = 20  # steps at most; each is a sound bound
@@ -62,7 +62,7 @@ def risk_bound(sets: NoGoSets, positions: FloatArray) -> FloatArray:
     j = sets.shapes.slots
     if len(j):
         walls = sets.taken(j)
-        room, sigma = clearance(walls, positions[j], 0.0), largest(walls)
+        room, sigma = wall_clearance(walls, positions[j], 0.0), largest(walls)
         risk[j] = ndtr(-_over(room, sigma))
     return risk
 

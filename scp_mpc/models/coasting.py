@@ -7,7 +7,7 @@ Notation:
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.robots.model import Model, courses
+from scp_mpc.models.model import Model, courses
 
 _ROUNDS = 5
 _CUT = 1e-9

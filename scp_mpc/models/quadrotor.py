@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_count, frozen
-from scp_mpc.robots.model import as_period, indices
-from scp_mpc.robots.planar_quadrotor import as_gravity
-from scp_mpc.robots.runge_kutta import ComponentModel
+from scp_mpc.models.model import as_period, indices
+from scp_mpc.models.planar_quadrotor import as_gravity
+from scp_mpc.models.runge_kutta import ComponentModel
 
 
 @dataclass(frozen=True, eq=False)

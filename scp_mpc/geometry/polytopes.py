@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray
+from scp_mpc.geometry.tangents import tangents
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.solid import Solid
-from scp_mpc.safety.tangents import tangents
 
 _NONE = -1
 _TIE = 1e-9  # [m] of depths below two faces that count as one

@@ -23,7 +23,7 @@ from scipy.linalg import solve_discrete_are
 
 from scp_mpc.arrays import FloatArray, as_array, as_weight, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 
 _ACCURACY = 1e-6  # of the Riccati equation, relative: S is exact to far more where it exists
 _TOUCHING = 1e-9  # distance from the unit circle, or from losing rank, that counts as none

@@ -16,8 +16,8 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_count, as_number, frozen
 from scp_mpc.errors import BoundsError
-from scp_mpc.robots.model import as_period, indices
-from scp_mpc.robots.runge_kutta import ComponentModel
+from scp_mpc.models.model import as_period, indices
+from scp_mpc.models.runge_kutta import ComponentModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,10 @@ nothing, as F moves all positions alike, and keeps that difference from losing d
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.obstacles.imm import Beliefs, MotionBank
+from scp_mpc.tracking.imm import Beliefs, MotionBank
 
 
-class Foresight:
+class HorizonPredictor:
     """Predicts positions over N intervals of `dt` seconds.
 
     Args:

@@ -29,8 +29,8 @@ from typing import NamedTuple
 import numpy as np
 
 from scp_mpc.arrays import BoolArray, FloatArray, IntArray
-from scp_mpc.obstacles.kalman import Gaussians, corrected, predicted
-from scp_mpc.obstacles.motion import Motion
+from scp_mpc.tracking.kalman import Gaussians, corrected, predicted
+from scp_mpc.tracking.motion import Motion
 
 _LEAST = 1e-12  # probability that no motion falls below: it must be able to come back
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, as_array, as_number, frozen
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 
 
 class Disturbed(LinearModel):

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.robots.bessel import bessel, bessel_pair
-from scp_mpc.robots.model import Linearisation, NonlinearModel, as_period, courses, indices
+from scp_mpc.models.bessel import bessel, bessel_pair
+from scp_mpc.models.model import Linearisation, NonlinearModel, as_period, courses, indices
 
 ComplexArray = NDArray[np.complex128]
 _IDENTITY = np.eye(4, 6)

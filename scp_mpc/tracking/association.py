@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.obstacles.kalman import Gaussians, mahalanobis
+from scp_mpc.tracking.kalman import Gaussians, mahalanobis
 
 
 def associate(

@@ -4,7 +4,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_number
 from scp_mpc.errors import InvalidArgumentError
-from scp_mpc.robots.linear import LinearModel
+from scp_mpc.models.linear import LinearModel
 
 
 class DoubleIntegrator(LinearModel):

@@ -11,7 +11,7 @@ from typing import Literal
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.safety.risk import containment_size, size_at_risk
+from scp_mpc.geometry.risk import containment_size, size_at_risk
 from scp_mpc.settings import require_positive
 
 CHI_SQUARE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom
