@@ -21,16 +21,20 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.scp.candidates import Passing, same_way
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record, recorded
+from scp_mpc.scp.iterate import NEGLIGIBLE
 from scp_mpc.scp.newton import corrected, downhill, refined
 from scp_mpc.scp.plan import Result, judge
-from scp_mpc.scp.rivals import is_vain
 from scp_mpc.scp.transcription import Relaxation, Transcription
 from scp_mpc.scp.trust_region import Region
 
 _SURPLUS = 0.1  # of the tolerance: worth one more iteration, whose convergence is quadratic
 _LEAST_COST = 1e-3  # relative to which products of forces and gaps are judged
+_PATIENCE = 3  # iterations before a run towards a goal is given up
+_FAR = 1.1  # share of the goal's merit above which it is
+_ALIKE = 0.01  # relative difference of cost of plans that may become the same
 
 
 class Loop:
@@ -59,8 +63,7 @@ class Loop:
         """
         at, clock, history = self._at, self._at.clock, list[Record]()
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
-        # give: who may yield; plain: whether Newton's step is left out.
-        region, give, plain, iterations = Region(at), Relaxation.NOBODY, False, 0
+        region, give, iterations = Region(at), Relaxation.NOBODY, 0  # give: who may yield
         reached: Nominal | None = None  # the last plan that was accepted
         while iterations < (limit or self._settings.max_iterations) and clock.allows("iteration"):
             with clock.task("iteration"):
@@ -69,7 +72,7 @@ class Loop:
                 end = at.solve(program, nominal)
                 convex = end.solution
                 if convex is not None:
-                    solution = convex if plain else refined(at, program, convex)
+                    solution = refined(at, program, convex)
                     trial = at.certify(program, solution)
             if convex is None:
                 more = at.next_relaxation(give, firm or not len(nominal.force))
@@ -90,26 +93,22 @@ class Loop:
                 accepted = region.accepts(nominal, reached, trial, program, convex, solution)
             if self._settings.history:
                 history.append(recorded(at, nominal, program, convex, trial, accepted))
+            if not accepted and not region.shrinks(nominal, program, solution):
+                break
             if not accepted:
-                if not region.shrinks(nominal, program, solution):
-                    break
                 continue
             before = inf if reached is None else reached.residuals.worst
-            nominal = reached = trial
-            planes = trial.planes
+            nominal, reached, planes = trial, trial, trial.planes
             give = give if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
             if self._is_converged(trial, before):
                 reached, direction = at.second_order(trial, program, solution)
                 away = downhill(at, reached, direction)
                 if away is None:
                     break
-                nominal, planes, plain = away, away.planes, False
+                nominal, planes = away, away.planes
                 continue
-            if goal is not None and is_vain(at, iterations, trial, goal):
+            if goal is not None and self._is_vain(iterations, trial, goal):
                 return None
-            # A Newton step that does not halve the residual is followed by a plain convex one.
-            slow = solution is not convex and trial.residuals.worst >= before / 2
-            plain = at.linear and slow
         return None if reached is None else self.result(reached, give, iterations, tuple(history))
 
     def result(
@@ -127,8 +126,16 @@ class Loop:
             nominal = replace(nominal, slack=np.maximum(-nominal.planes.g, 0.0))
         merit = at.merit(nominal.cost, float(nominal.slack.sum()), nominal.excess)
         cap = at.problem.slack_weight if give is Relaxation.EVERYBODY else inf
-        iterate = at.iterate(nominal, cap)
-        return Result(iterate, nominal.cost, merit, residuals, status, iterations, nominal, history)
+        return Result(
+            at.iterate(nominal, cap),
+            nominal.cost,
+            merit,
+            residuals,
+            status,
+            iterations,
+            nominal,
+            history,
+        )
 
     def _is_converged(self, trial: Nominal, before: float) -> bool:
         """Whether a plan is certified, and another iteration would hardly better it."""
@@ -136,3 +143,17 @@ class Loop:
         product = residuals.complementarity / min(1.0, max(trial.cost, _LEAST_COST))
         enough = tolerance if before <= tolerance else _SURPLUS * tolerance
         return max(residuals.worst, product) <= enough
+
+    def _is_vain(self, iterations: int, trial: Nominal, goal: Result) -> bool:
+        """Whether a run is too far above its goal, or about to end just there.
+
+        The cost falls by less each time; where Newton's steps raise it, that is little.
+        """
+        at, cost, there = self._at, trial.cost, goal.iterate
+        if goal.status.ok and iterations >= _PATIENCE and cost > _FAR * goal.merit:
+            return True
+        if not len(trial.force) or abs(cost - goal.cost) > _ALIKE * goal.cost:
+            return False
+        mine = Passing(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
+        path = at.nodes.positions(there.states, there.inputs)
+        return same_way(at.step, mine, Passing(path, there.touched[: at.step.count]))
