@@ -126,16 +126,8 @@ class Loop:
             nominal = replace(nominal, slack=np.maximum(-nominal.planes.g, 0.0))
         merit = at.merit(nominal.cost, float(nominal.slack.sum()), nominal.excess)
         cap = at.problem.slack_weight if give is Relaxation.EVERYBODY else inf
-        return Result(
-            at.iterate(nominal, cap),
-            nominal.cost,
-            merit,
-            residuals,
-            status,
-            iterations,
-            nominal,
-            history,
-        )
+        given = nominal.cost, merit, residuals, status, iterations, nominal, history
+        return Result(at.iterate(nominal, cap), *given)
 
     def _is_converged(self, trial: Nominal, before: float) -> bool:
         """Whether a plan is certified, and another iteration would hardly better it."""
@@ -145,10 +137,7 @@ class Loop:
         return max(residuals.worst, product) <= enough
 
     def _is_vain(self, iterations: int, trial: Nominal, goal: Result) -> bool:
-        """Whether a run is too far above its goal, or about to end just there.
-
-        The cost falls by less each time; where Newton's steps raise it, that is little.
-        """
+        """Whether a run, whose cost falls by ever less, is far above its goal or ends there."""
         at, cost, there = self._at, trial.cost, goal.iterate
         if goal.status.ok and iterations >= _PATIENCE and cost > _FAR * goal.merit:
             return True
