@@ -3,20 +3,58 @@
     python benchmarks/run.py --out benchmarks/results            all of them
     python benchmarks/run.py --out out/bench --only scaling --steps 50
 
-horizon     (a, c, e) a control step at N = 8 and N = 30, and among 5 and 12 obstacles, against
-            IPOPT, Fatrop, CasADi's SQP with three QP solvers, SLSQP, and scp_mpc with each of its
-            own QP solvers
-scaling     (b) closed loops over horizons 5 to 200 and 1 to 50 obstacles, with fitted exponents
+horizon     a control step at N = 8 and N = 30, and among 5 and 12 obstacles, against IPOPT, Fatrop,
+            CasADi's SQP with three QP solvers, SLSQP, and scp_mpc with each of its own QP solvers
+scaling     closed loops over horizons 5 to 200 and 1 to 50 obstacles, with fitted exponents
 deadlines   closed loops among 12 obstacles with a deadline, and how late their steps end
-optimality  (d) plan costs against the best of 24 starts of IPOPT
+optimality  plan costs against the best of 24 starts of IPOPT
 programs    QP solvers on recorded programs
 robots      closed loops of all robots, relative to the double integrator among 5 obstacles
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
-from scp_mpc.comparison import BENCHMARKS, run
+from benchmarks import deadlines, horizon_timing, optimality, programs, robots, scaling
+from benchmarks.processes import in_one_thread
+from benchmarks.tables import write
+
+BENCHMARKS = ("horizon", "scaling", "deadlines", "optimality", "programs", "robots")
+
+
+def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], object]) -> None:
+    """Run one benchmark in a process of one thread and write its files into a folder.
+
+    Args:
+        name: One of `BENCHMARKS`.
+        out: The folder.
+        steps: Control steps of each closed loop.
+        seed: Of turns and random starts.
+        echo: Takes the Markdown table.
+    """
+    if name == "horizon":
+        horizon_timing.main(out, steps, seed, echo=echo, crowds=True)
+    elif name == "scaling":
+        found = in_one_thread(scaling.rows, steps)
+        fitted = scaling.exponents(found)
+        text = scaling.markdown(found) + (
+            f"\n\nMedian ~ N^{fitted['a']:.2f} (one obstacle, N >= 30, one start), "
+            f"~ M^{fitted['b']:.2f} (N = 30, one start)."
+        )
+        content = {"rows": found, "exponents": fitted}
+        write(out, scaling.NAME, text, content, scaling.figure(found, fitted), echo)
+    elif name == "optimality":
+        found = in_one_thread(optimality.rows, steps, optimality.STARTS, seed)
+        write(out, optimality.NAME, optimality.markdown(found), {"rows": found}, echo=echo)
+    elif name == "programs":
+        found = in_one_thread(programs.rows, steps)
+        write(out, programs.NAME, programs.markdown(found), {"rows": found}, echo=echo)
+    else:
+        which = {"deadlines": deadlines, "robots": robots}[name]
+        found = in_one_thread(which.rows, steps)
+        write(out, which.NAME, which.markdown(found), {"rows": found}, which.figure(found), echo)
+
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
@@ -27,5 +65,5 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int, default=200, help="control steps of each closed loop")
     parser.add_argument("--seed", type=int, default=0, help="of turns and random starts")
     arguments = parser.parse_args()
-    for name in arguments.only:
-        run(name, arguments.out, arguments.steps, arguments.seed, print)
+    for each in arguments.only:
+        run(each, arguments.out, arguments.steps, arguments.seed, print)

@@ -1,4 +1,4 @@
-"""The command line: `scp-mpc report`, `bench`, `coverage`, `replay`. The only file that prints."""
+"""The command line: `scp-mpc report`, `coverage`, `replay`. The only file that prints."""
 
 import json as json_format
 from collections.abc import Iterator
@@ -117,22 +117,6 @@ def report(
             run = next(run for run in runs if run.scenario.name == _ANIMATED)
             written += f", {write_animation(run, out / f'{_ANIMATED}.gif').name}"
         typer.echo(f"Written to {out}: {written}")
-
-
-@app.command()
-def bench(
-    json: Annotated[Path | None, typer.Option(help="File for the numbers.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Directory for table and figure.")] = None,
-    steps: Annotated[int, typer.Option(help="Control steps per horizon.")] = 200,
-    seed: Annotated[int, typer.Option(help="Seed of the disturbance.")] = 0,
-) -> None:
-    """Time one control step against other solvers (extra: peers)."""
-    with _one_line_errors():
-        from scp_mpc.comparison import horizon_timing
-
-        if seed < 0:
-            raise BoundsError("seed", f"{seed} is negative")
-        horizon_timing.main(json, out, steps, seed, echo=typer.echo)
 
 
 _File = Annotated[

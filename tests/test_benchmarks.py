@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks import optimality, programs, run, scaling
+from benchmarks.peers import Ipopt, Staged
+from benchmarks.recorded import record
 from scp_mpc import MPC, InvalidArgumentError
-from scp_mpc.comparison import Ipopt, Staged, optimality, programs, record, runner, scaling
-from scp_mpc.comparison.scaling_figure import scaling_figure
 from scp_mpc.simulation import SCENARIOS, Crowd
 
 
@@ -63,7 +64,7 @@ def test_scaling_counts_and_fits():
     ]
     assert scaling.exponents(made_up) == pytest.approx({"a": 1.5, "b": 2.0})
     assert scaling.markdown(table).count("\n") == 1 + len(table)
-    figure = scaling_figure(table, scaling.exponents(table))
+    figure = scaling.figure(table, scaling.exponents(table))
     assert len(figure.axes) == 2
 
 
@@ -88,11 +89,11 @@ def test_programs_of_a_tiny_run():
 
 
 def test_the_runner_writes_what_it_shows(monkeypatch, tmp_path):
-    monkeypatch.setattr(runner, "in_one_thread", lambda task, *given: task(*given))
+    monkeypatch.setattr(run, "in_one_thread", lambda task, *given: task(*given))
     monkeypatch.setattr(scaling, "HORIZONS", (8,))
     monkeypatch.setattr(programs, "recorded", lambda steps: programs_of(steps))
     shown = []
-    runner.run("programs", tmp_path, 2, 0, shown.append)
+    run.run("programs", tmp_path, 2, 0, shown.append)
     assert (tmp_path / "programs.md").read_text().rstrip("\n") == shown[0]
     numbers = json.loads((tmp_path / "programs.json").read_text())
     assert {"rows", "provenance"} <= set(numbers)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from instances import DT, obstacle, problem, straight_reference
 from rebuilt import couplings_of, rebuilt
 
+from benchmarks.audit import audit
+from benchmarks.peers.violation import largest_violation
 from scp_mpc import MPC, SCP, Settings, Status
-from scp_mpc.comparison.audit import audit
-from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.deadline import Clock
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step

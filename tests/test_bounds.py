@@ -9,6 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import problem, straight_reference
 
+from benchmarks.audit import audit
+from benchmarks.peers.nlp import Unknowns
+from benchmarks.peers.staged import Staged
 from scp_mpc import (
     MPC,
     SCP,
@@ -20,9 +23,6 @@ from scp_mpc import (
     ShapeError,
     Status,
 )
-from scp_mpc.comparison.audit import audit
-from scp_mpc.comparison.nlp import Unknowns
-from scp_mpc.comparison.staged import Staged
 from scp_mpc.scp import Multipliers
 
 NAN, INF = np.nan, np.inf

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 import scp_mpc.cli
 from scp_mpc import __version__
-from scp_mpc.comparison import PeerMissingError, horizon_timing
 from scp_mpc.report import COLUMNS, FIGURES
 
 SCENARIO_NAMES = ["scenario-1", "scenario-2", "scenario-3", "scenario-4"]
@@ -97,31 +96,6 @@ def test_value_of_the_wrong_kind_is_a_usage_error(tmp_path):
     assert result.exit_code == 2
     assert "--steps" in result.output
     assert "Traceback" not in result.output
-
-
-def test_bench_passes_its_options_on(tmp_path, monkeypatch):
-    calls = []
-
-    def main(json_path, out, steps, seed, **others):
-        calls.append((json_path, out, steps, seed))
-        others["echo"]("| a table |")
-
-    monkeypatch.setattr(horizon_timing, "main", main)
-    file = tmp_path / "bench.json"
-    result = invoke("bench", "--json", file, "--steps", 5, "--out", tmp_path, "--seed", 2)
-    assert result.exit_code == 0, result.output
-    assert calls == [(file, tmp_path, 5, 2)]
-    assert result.output == "| a table |\n"
-
-
-def test_bench_without_a_peer_says_what_to_install(monkeypatch):
-    def main(*_args, **_kwargs):
-        raise PeerMissingError("casadi")
-
-    monkeypatch.setattr(horizon_timing, "main", main)
-    result = invoke("bench")
-    assert result.exit_code == 1
-    assert result.output == ("error: casadi is not installed; it comes with the extra 'peers'\n")
 
 
 @pytest.mark.parametrize("package", ["typer", "rich.console", "tqdm"])

@@ -6,6 +6,19 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks import horizon_timing
+from benchmarks.attempts import Attempts, rows
+from benchmarks.horizon_timing import main, measure
+from benchmarks.peers import (
+    Ipopt,
+    Ours,
+    PeerMissingError,
+    PeerPlan,
+    Slsqp,
+    largest_violation,
+)
+from benchmarks.processes import in_one_thread
+from benchmarks.recorded import record
 from scp_mpc import (
     MPC,
     SCP,
@@ -16,19 +29,6 @@ from scp_mpc import (
     Problem,
     Settings,
 )
-from scp_mpc.comparison import (
-    Ipopt,
-    Ours,
-    PeerMissingError,
-    PeerPlan,
-    Slsqp,
-    horizon_timing,
-    largest_violation,
-    record,
-)
-from scp_mpc.comparison.attempts import Attempts, rows
-from scp_mpc.comparison.horizon_timing import main, measure
-from scp_mpc.comparison.one_thread import in_one_thread
 from scp_mpc.simulation import SCENARIOS
 from scp_mpc.trajectory import rollout
 
@@ -50,8 +50,8 @@ KEYS = {
 OTHERS = {"fatrop", "sqp-qrqp", "sqp-hpipm", "sqp-osqp"}
 SOLVERS = [
     "scp_mpc",
-    "scp_mpc (multi-start)",
-    "scp_mpc (piqp)",
+    "scp_mpc, one start",
+    "scp_mpc, piqp",
     "ipopt",
     "fatrop",
     "sqp-qrqp",
@@ -291,10 +291,10 @@ def test_missing_casadi_keeps_its_row(monkeypatch, tmp_path, caplog):
     monkeypatch.setattr(horizon_timing, "in_one_thread", lambda task, *given: task(*given))
     echoed = []
     with caplog.at_level(logging.WARNING):
-        main(tmp_path / "deep" / "bench.json", tmp_path / "out", 2, 0, echo=echoed.append)
+        main(tmp_path / "deep" / "out", 2, 0, echo=echoed.append)
     assert "casadi is not installed" in caplog.text
     assert "ipopt is not installed: N = 8 is empty" in caplog.text
-    content = json.loads((tmp_path / "deep" / "bench.json").read_text())
+    content = json.loads((tmp_path / "deep" / "out" / "horizon_timing.json").read_text())
     table = {row["solver"]: row for row in content["rows"]}
     ours, ipopt = table["scp_mpc"], table["ipopt"]
     assert ipopt == dict.fromkeys(KEYS) | {
@@ -309,15 +309,15 @@ def test_missing_casadi_keeps_its_row(monkeypatch, tmp_path, caplog):
     assert {"machine", "cores", "python", "numpy", "osqp", "casadi", "commit", "date"} <= set(
         content["provenance"]
     )
-    assert echoed == [(tmp_path / "out" / "horizon_timing.md").read_text().rstrip("\n")]
+    assert echoed == [(tmp_path / "deep" / "out" / "horizon_timing.md").read_text().rstrip("\n")]
     assert "| ipopt | 8 | 1 | 2 | n/a |" in echoed[0]
-    assert (tmp_path / "out" / "horizon_timing.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "deep" / "out" / "horizon_timing.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_library_prints_nothing(monkeypatch, capfd):
+def test_library_prints_nothing(monkeypatch, capfd, tmp_path):
     monkeypatch.setattr(horizon_timing, "_SCENARIOS", (SCENARIOS["scenario-2"],))
     echoed = []
-    main(None, None, steps=1, seed=0, echo=echoed.append)
+    main(tmp_path, steps=1, seed=0, echo=echoed.append)
     assert len(echoed) == 1
     assert "| ipopt | 8 | 1 | 1 |" in echoed[0]
     assert capfd.readouterr() == ("", "")

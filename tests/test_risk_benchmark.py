@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import beta, norm
 
-from scp_mpc import SCP, BoundsError, InvalidArgumentError
-from scp_mpc.comparison import risk, risk_episodes
-from scp_mpc.comparison.risk_figure import risk_figure
-from scp_mpc.comparison.risk_scenes import HORIZON, all_scenes
-from scp_mpc.comparison.risk_settings import (
+from benchmarks import risk, risk_episodes
+from benchmarks.risk_report import markdown, risk_figure
+from benchmarks.risk_scenes import HORIZON, all_scenes
+from benchmarks.risk_settings import (
     KINDS,
     RiskSetting,
     all_settings,
     driven_settings,
     problem_for,
 )
-from scp_mpc.comparison.risk_store import RiskStore
-from scp_mpc.comparison.risk_table import markdown
+from benchmarks.store import Store
+from scp_mpc import SCP, BoundsError, InvalidArgumentError
 from scp_mpc.simulation import applicable_couplings, contacts, robot_path
 
 SAMPLES = 2000
@@ -166,10 +165,10 @@ def test_a_run_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
 
 def test_records_of_other_code_are_not_used(tmp_path, monkeypatch):
     path = tmp_path / "store.jsonl"
-    assert RiskStore(path, seed=0).get("a", lambda: {"n": 1}) == {"n": 1}
-    assert RiskStore(path, seed=0).get("a", lambda: {"n": 2}) == {"n": 1}
-    monkeypatch.setattr("scp_mpc.comparison.risk_store._code", lambda: "other")
-    assert RiskStore(path, seed=0).get("a", lambda: {"n": 3}) == {"n": 3}
+    assert Store(path, seed=0).get("a", lambda: {"n": 1}) == {"n": 1}
+    assert Store(path, seed=0).get("a", lambda: {"n": 2}) == {"n": 1}
+    monkeypatch.setattr("benchmarks.store._code", lambda: "other")
+    assert Store(path, seed=0).get("a", lambda: {"n": 3}) == {"n": 3}
 
 
 def test_the_same_seed_gives_the_same_rows_and_promises_share_realisations():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from scp_mpc.comparison import robots
-from scp_mpc.comparison.robots_figure import robots_figure
+from benchmarks import robots
 from scp_mpc.simulation.circuits import CIRCLING, Circuit
 
 
@@ -49,4 +48,4 @@ def test_a_tiny_run_is_counted_and_drawn():
         assert 0 < row["wall"]["median"] <= row["wall"]["p99"] <= row["wall"]["max"]
         assert row["clearance"] > 0
     assert robots.markdown(table).count("\n") == 1 + len(table)
-    assert len(robots_figure(table).axes) == 1
+    assert len(robots.figure(table).axes) == 1

@@ -303,8 +303,8 @@ def test_a_robot_drives_through_doors():
 
 def test_peers_refuse_polytopes():
     pytest.importorskip("casadi")
-    from scp_mpc.comparison.ipopt import Ipopt
-    from scp_mpc.comparison.slsqp import Slsqp
+    from benchmarks.peers.ipopt import Ipopt
+    from benchmarks.peers.slsqp import Slsqp
 
     case, walls = problem(HORIZON, max_obstacles=2), WORLDS["slalom"]
     guess = SCP(case).solve(REF[0], REF).iterate

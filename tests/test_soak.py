@@ -8,12 +8,11 @@ import pytest
 from instances import obstacle, problem, straight_reference
 from judge import exact_distances
 
+from benchmarks.audit import _exact, audit
+from benchmarks.soak import markdown, run_soak, summarise
+from benchmarks.soak_chunk import run_chunk
+from benchmarks.soak_worlds import FAULTS, kinds
 from scp_mpc import MPC, SCP, InvalidArgumentError, Status
-from scp_mpc.comparison import run_soak
-from scp_mpc.comparison.audit import _exact, audit
-from scp_mpc.comparison.soak_chunk import run_chunk
-from scp_mpc.comparison.soak_table import markdown, summarise
-from scp_mpc.comparison.soak_worlds import FAULTS, kinds
 
 N = 8
 REF = straight_reference(N)
@@ -59,7 +58,7 @@ def test_bad_soaks_are_refused(values, tmp_path):
 def test_nothing_missing_is_nothing_done(tmp_path, monkeypatch):
     file = tmp_path / "soak.jsonl"
     file.write_text(json.dumps(run_chunk(0, 0, 60)) + "\n")
-    monkeypatch.setattr("scp_mpc.comparison.soak.run_chunk", None)
+    monkeypatch.setattr("benchmarks.soak.run_chunk", None)
     assert run_soak(tmp_path, steps=60)["steps"] == 60
 
 
@@ -113,7 +112,7 @@ def test_the_audit_agrees_with_the_judge():
 
 def test_the_soak_would_notice_faults(monkeypatch):
     step = MPC.step
-    monkeypatch.setattr("scp_mpc.comparison.soak_chunk._TWIN", 0.0)
+    monkeypatch.setattr("benchmarks.soak_chunk._TWIN", 0.0)
 
     def broken(self, x0, x_ref, obstacles=(), **named):
         plan = step(self, np.nan_to_num(x0), x_ref, obstacles, **named)
@@ -147,8 +146,8 @@ def test_the_soak_would_notice_a_trace_of_a_bad_call(monkeypatch):
             self.reset()
             raise
 
-    monkeypatch.setattr("scp_mpc.comparison.soak_chunk._TWIN", 1.0)
-    monkeypatch.setattr("scp_mpc.comparison.soak_chunk._BAD_CALL", 0.3)
+    monkeypatch.setattr("benchmarks.soak_chunk._TWIN", 1.0)
+    monkeypatch.setattr("benchmarks.soak_chunk._BAD_CALL", 0.3)
     assert run_chunk(0, 0, 400)["traces"] == 0
     monkeypatch.setattr(MPC, "step", forgetful)
     assert run_chunk(0, 0, 400)["traces"] > 0

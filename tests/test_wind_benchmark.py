@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from scp_mpc.comparison import wind
-from scp_mpc.comparison.wind_figure import wind_figure
-from scp_mpc.comparison.wind_table import markdown
-from scp_mpc.comparison.wind_variants import (
+from benchmarks import wind
+from benchmarks.wind_report import markdown, wind_figure
+from benchmarks.wind_variants import (
     ALONE,
     BEST,
     CALM,

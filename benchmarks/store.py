@@ -7,10 +7,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-_PACKAGE = Path(__file__).resolve().parent.parent
+_ROOT = Path(__file__).resolve().parent.parent
 
 
-class RiskStore:
+class Store:
     """Records by key; a record counts only for the code, seed and sizes it was measured with.
 
     Args:
@@ -52,8 +52,9 @@ class RiskStore:
 
 @cache
 def _code() -> str:
-    """Digest of the package's sources: numbers of other code are not mixed in."""
+    """Digest of the sources: numbers of other code are not mixed in."""
     digest = sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
+    folders = (_ROOT / "scp_mpc", _ROOT / "benchmarks")
+    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from benchmarks.peers.ipopt import import_casadi, parameters
+from benchmarks.peers.nlp import linear_model, read, refuse_limits
+from benchmarks.peers.plan import PeerPlan
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.ipopt import import_casadi, parameters
-from scp_mpc.comparison.nlp import linear_model, read, refuse_limits
-from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem

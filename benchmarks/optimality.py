@@ -1,5 +1,7 @@
 """How good the plans are: against the best that IPOPT finds from many starts.
 
+    python benchmarks/run.py --only optimality --out out/bench
+
 On every step of scenarios 1 and 2 in closed loop at which an obstacle shapes the plan, IPOPT
 starts from the guess that the controller had and from random paths: the free plan, bent by up to
 four metres in a random direction, ever more along a random part of the horizon.
@@ -10,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from scp_mpc.comparison.attempts import TOLERATED
-from scp_mpc.comparison.ipopt import Ipopt
-from scp_mpc.comparison.progress import progress
+from benchmarks.attempts import TOLERATED
+from benchmarks.peers.ipopt import Ipopt
+from benchmarks.progress import progress
+from benchmarks.tables import table
 from scp_mpc.control.mpc import MPC
 from scp_mpc.geometry.margin import Margin
 from scp_mpc.scp.solver import SCP
@@ -81,18 +84,25 @@ def measure(
     }
 
 
-def markdown(table: Sequence[dict[str, Any]]) -> str:
+def markdown(found: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown."""
-    head = (
-        "| N | s_min | Sum of plan costs | Active steps | Within 1 % of the best of IPOPT's starts "
-        "| More than 1 % better | Largest gap |\n|--:|--:|--:|--:|--:|--:|--:|"
+    names = (
+        "N | s_min | Sum of plan costs | Active steps | Within 1 % of the best of IPOPT's starts "
+        "| More than 1 % better | Largest gap"
     )
-    lines = [
-        f"| {row['horizon']} | {row['s_min']:.2f} | {row['cost']:.1f} | {row['active']} "
-        f"| {row['within']} | {row['better']} | {row['worst']:.1%} |"
-        for row in table
-    ]
-    return "\n".join([head, *lines])
+    cells = (
+        (
+            row["horizon"],
+            f"{row['s_min']:.2f}",
+            f"{row['cost']:.1f}",
+            row["active"],
+            row["within"],
+            row["better"],
+            f"{row['worst']:.1%}",
+        )
+        for row in found
+    )
+    return table(names, "rrrrrrr", cells)
 
 
 def _bent(states: Any, inputs: Any, rng: np.random.Generator) -> Trajectory:

@@ -1,19 +1,71 @@
-"""Tracking errors under wind: every run a point, every mean with its interval."""
+"""Tracking under wind: tables, and a figure where every run is a point."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchmarks.figures import BLUE, VERMILION, canvas, plain
+from benchmarks.tables import table
+
 Row = dict[str, Any]
 
-# Okabe and Ito's colours; filled (rejection) against hollow (nominal) helps in print.
-_COLOURS = {30: "#0072B2", 8: "#D55E00"}
+_NAMES = (
+    "N | Controller | Disturbance | Runs | RMS error [m]: mean (95 %) | median "
+    "| Difference (95 %) | To the report's way (95 %) | Median error [m] | Least clearance [m] "
+    "| Contacts | Slack steps"
+)
+_GROUPS = {
+    "main": "The report's wind, its obstacle, its no-go sets",
+    "calm": "No disturbance",
+    "alone": "The report's wind without an obstacle",
+    "others": "Other disturbances",
+    "foresight": "The robot's own spread in the no-go sets",
+    "exact": "The report's wind with exact no-go sets",
+}
+
+_COLOURS = {30: BLUE, 8: VERMILION}  # filled (rejection) against hollow (nominal)
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+def markdown(groups: Mapping[str, Sequence[Row]], steps: int) -> str:
+    """All groups with a line of explanation each."""
+    parts = [
+        f"{steps} steps per run; the same winds for all variants. The difference is to the first "
+        "row with the same disturbance, wind by wind; the report's way is N = 30, nominal, from "
+        "the last plan alone. Error: distance from the reference of the same time; its RMS is over "
+        "a run, mean and median are over the runs. Clearance: from the no-go set."
+    ]
+    for group, rows in groups.items():
+        if not rows:
+            continue
+        parts.append(f"{_GROUPS[group]}:")
+        parts.append(table(_NAMES, "rllrlrllrrrr", map(_cells, rows)))
+    return "\n\n".join(parts)
+
+
+def _cells(row: Row) -> list[object]:
+    return [
+        row["horizon"],
+        row["controller"],
+        row["disturbance"],
+        row["runs"],
+        f"{row['rms_mean']:.3f} {_ends(row['rms_interval'])}",
+        f"{row['rms_median']:.3f}",
+        f"{row['excess']:+.3f} {_ends(row['excess_interval'])}",
+        f"{row['beyond']:+.3f} {_ends(row['beyond_interval'])}" if "beyond" in row else "",
+        f"{row['usual']:.3f}",
+        f"{row['clearance']:.3f}" if row["obstacle"] else "",
+        row["contact"],
+        row["slack"],
+    ]
+
+
+def _ends(ends: Sequence[float]) -> str:
+    return f"({ends[0]:.3f} to {ends[1]:.3f})"
 
 
 def wind_figure(main: Sequence[Row], others: Sequence[Row] = ()) -> Figure:
@@ -25,9 +77,7 @@ def wind_figure(main: Sequence[Row], others: Sequence[Row] = ()) -> Figure:
     """
     rows = max(len(main), len(others))
     count = 3 if others else 2
-    figure = Figure(figsize=(4.0 + 5.2 * count, 2.2 + 0.45 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, count)
+    figure, panels = canvas(4.0 + 5.2 * count, 2.2 + 0.45 * rows, count)
     title = f"{main[0]['disturbance']}, {main[0]['runs']} runs each"
     _panel(panels[0], main, [_who(row) for row in main], "rms", "rms_mean", "rms_interval")
     panels[0].set_xlabel("RMS tracking error of a run [m]", fontsize=14)
@@ -74,17 +124,12 @@ def _panel(
             elinewidth=2.0,
             capsize=5,
         )
-    axes.set_yticks(range(len(rows)), names)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_xscale("log")
     shown = np.concatenate([row[every] for row in rows])
     low, high = 0.8 * shown.min(), 1.25 * shown.max()
-    ticks = [t for t in _TICKS if low <= t <= high]
+    plain(axes, "x", [t for t in _TICKS if low <= t <= high])
     axes.set_xlim(low, high)
-    axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
-    axes.minorticks_off()
-    axes.grid(axis="x", alpha=0.3)
-    axes.tick_params(labelsize=12)
+    axes.set_yticks(range(len(rows)), names)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
 
 
 def _who(row: Row) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import Bounds, minimize
 
+from benchmarks.peers.nlp import Unknowns, linear_model, read
+from benchmarks.peers.plan import PeerPlan
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model, read
-from scp_mpc.comparison.peer_plan import PeerPlan
 from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.risk_scenes import DT, rotated
+from benchmarks.risk_settings import RiskSetting, problem_for
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.risk_scenes import DT, rotated
-from scp_mpc.comparison.risk_settings import RiskSetting, problem_for
 from scp_mpc.control.mpc import MPC
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor

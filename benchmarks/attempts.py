@@ -7,8 +7,8 @@ from typing import TypedDict
 
 import numpy as np
 
+from benchmarks.peers.plan import PeerPlan
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.peer_plan import PeerPlan
 
 TOLERATED = 1e-5  # largest violation of a plan that counts as feasible
 _YARDSTICK = "scp_mpc"

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
+from benchmarks.peers.violation import largest_violation
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.violation import largest_violation
 from scp_mpc.errors import ScpMpcError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from scp_mpc.comparison.audit import audit
-from scp_mpc.comparison.soak_worlds import FAULTS, Kind, World, kinds
+from benchmarks.audit import audit
+from benchmarks.soak_worlds import FAULTS, Kind, World, kinds
 from scp_mpc.control.mpc import MPC
 from scp_mpc.scp.plan import Plan
 

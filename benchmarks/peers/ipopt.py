@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from benchmarks.peers.nlp import Unknowns, linear_model, read
+from benchmarks.peers.plan import PeerMissingError, PeerPlan
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import Unknowns, linear_model, read
-from scp_mpc.comparison.peer_plan import PeerMissingError, PeerPlan
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.geometry.ellipsoid import signed_distance
 from scp_mpc.geometry.no_go import NoGoSets

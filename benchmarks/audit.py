@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
+from benchmarks.peers.nlp import linear_model, require_round
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.nlp import linear_model, require_round
 from scp_mpc.geometry.margin import JointRisk, StageRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem

@@ -6,8 +6,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.comparison.peer_plan import PeerPlan
-from scp_mpc.comparison.violation import largest_violation
+from benchmarks.peers.plan import PeerPlan
+from benchmarks.peers.violation import largest_violation
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.scp.iterate import Iterate

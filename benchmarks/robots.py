@@ -1,22 +1,23 @@
 """Closed loops of all robots: time per step, relative to the double integrator among five.
 
-The machine may be shared: ratios within one run say more than milliseconds. Besides the wall time
-of each call of `MPC.step` there is its thread's own time, which does not count what others take.
+    python benchmarks/run.py --only robots --out out/bench
+
+The machine may be shared: ratios within one run say more than milliseconds.
 """
 
-import gc
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from benchmarks.figures import BLUE, VERMILION, canvas, legend_below, plain
+from benchmarks.progress import progress
+from benchmarks.tables import table
+from benchmarks.timing import closed_loop, milliseconds
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.progress import progress
-from scp_mpc.control.mpc import MPC
-from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.circuits import Circuit
@@ -25,6 +26,7 @@ from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 
 NAME = "robots"  # of the files
+_COLOURS = {True: VERMILION, False: BLUE}
 _YARDSTICK = "double integrator 2-D, crowd of 5"
 
 
@@ -82,59 +84,62 @@ def rows(steps: int, courses: Sequence[Course] | None = None) -> list[dict[str, 
     """
     courses = COURSES if courses is None else courses
     with progress(2 * len(courses) * steps) as advance:
-        table = [
+        found = [
             _row(course, multi_start, steps, advance)
             for course in courses
             for multi_start in (True, False)
         ]
-    for row in table:
+    for row in found:
         for clock in ("wall", "thread"):
             for key in ("median", "p99"):
-                row[f"{clock}_{key}_ratio"] = row[clock][key] / table[0][clock][key]
-    return table
+                row[f"{clock}_{key}_ratio"] = row[clock][key] / found[0][clock][key]
+    return found
 
 
-def markdown(table: Sequence[dict[str, Any]]) -> str:
+def markdown(found: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown; ratios are those of the thread's time."""
-    head = (
-        "| Robot | N | Obstacles | Points | Multi-start | Median [ms] | p99 [ms] | Max [ms] "
+    names = (
+        "Robot | N | Obstacles | Nodes | Multi-start | Median [ms] | p99 [ms] | Max [ms] "
         "| Thread: median, p99 [ms] | Median ratio | p99 ratio | Certified, no slack "
-        "| Iterations: median, max | Clearance [m] |\n"
-        "|:--|--:|--:|--:|:--|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
+        "| Iterations: median, max | Clearance [m]"
     )
-    return "\n".join([head, *map(_line, table)])
+    return table(names, "lrrrlrrrrrrrrr", map(_cells, found))
+
+
+def figure(found: Sequence[dict[str, Any]]) -> Figure:
+    """Draw a row per course: multi-start at every step, and one start."""
+    names = list(dict.fromkeys(map(_name, found)))
+    drawing, (axes,) = canvas(11.0, 1.6 + 0.45 * len(names))
+    for multi_start, shift in ((True, -0.15), (False, 0.15)):
+        part = [row for row in found if row["multi_start"] is multi_start]
+        y = np.array([names.index(_name(row)) for row in part]) + shift
+        median = [row["wall"]["median"] for row in part]
+        p99 = [row["wall"]["p99"] for row in part]
+        colour, label = _COLOURS[multi_start], "multi-start" if multi_start else "one start"
+        axes.hlines(y, median, p99, color=colour, linewidth=2.0)
+        axes.plot(median, y, "o", color=colour, label=f"{label}: median")
+        axes.plot(p99, y, "|", color=colour, markersize=12, label=f"{label}: p99")
+    plain(axes, "x", size=11)
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel("time per control step [ms]", fontsize=13)
+    legend_below(drawing, axes, 4)
+    return drawing
 
 
 def _row(
     course: Course, multi_start: bool, steps: int, advance: Callable[[], object]
 ) -> dict[str, Any]:
-    problem, world, x = course.problem, course.world, course.world.start()
-    given: Callable[[int], tuple[FloatArray, list[ObstaclePrediction]]] = lambda k: (  # noqa: E731
-        world.states(k),
-        world.predictions(k),
+    problem = course.problem
+    run = list(
+        closed_loop(course.world, problem, Settings(multi_start=multi_start), steps, advance)
     )
-    settings = Settings(multi_start=multi_start)
-    MPC(problem, settings).step(x, *given(0))
-    mpc, plans, wall, thread, gaps = MPC(problem, settings), [], [], [], []
-    gc.collect()
-    gc.freeze()
-    try:
-        for k in range(steps):
-            x_ref, obstacles = given(k)
-            began, worked = perf_counter(), thread_time()
-            plan = mpc.step(x, x_ref, obstacles)
-            thread.append(thread_time() - worked)
-            wall.append(perf_counter() - began)
-            after = problem.model.step(x, plan.u0)
-            path = robot_path(problem.model, np.array([x, after]), plan.u0[None])[0]
-            gaps.append(course.clearance(k, path[:: FINE // 8]))
-            plans.append((plan.status.name, plan.iterations))
-            x = after
-            advance()
-    finally:
-        gc.unfreeze()
-    statuses = Counter(status for status, _ in plans)
-    iterations = [count for _, count in plans]
+    gaps = []
+    for k, step in enumerate(run):
+        after = problem.model.step(step.x, step.plan.u0)
+        path = robot_path(problem.model, np.array([step.x, after]), step.plan.u0[None])[0]
+        gaps.append(course.clearance(k, path[:: FINE // 8]))
+    iterations = [step.plan.iterations for step in run]
     return {
         "robot": course.name,
         "horizon": problem.horizon,
@@ -142,27 +147,17 @@ def _row(
         "points": problem.nodes_per_interval,
         "multi_start": multi_start,
         "steps": steps,
-        "wall": _summary(wall),
-        "thread": _summary(thread),
-        "statuses": dict(statuses),
+        "wall": milliseconds([step.wall for step in run]),
+        "thread": milliseconds([step.thread for step in run]),
+        "statuses": dict(Counter(step.plan.status.name for step in run)),
         "iterations": [float(np.median(iterations)), max(iterations)],
         "clearance": min(gaps),
     }
 
 
-def _summary(seconds: Sequence[float]) -> dict[str, float]:
-    """Milliseconds."""
-    t = 1e3 * np.array(seconds)
-    return {
-        "median": float(np.median(t)),
-        "p99": float(np.percentile(t, 99)),
-        "max": float(t.max()),
-    }
-
-
-def _line(row: dict[str, Any]) -> str:
+def _cells(row: dict[str, Any]) -> tuple[object, ...]:
     thread = row["thread"]
-    cells = (
+    return (
         *(row[key] for key in ("robot", "horizon", "obstacles", "points")),
         "on" if row["multi_start"] else "off",
         *(f"{row['wall'][key]:.2f}" for key in ("median", "p99", "max")),
@@ -172,4 +167,7 @@ def _line(row: dict[str, Any]) -> str:
         "{:g}, {}".format(*row["iterations"]),
         f"{row['clearance']:.2f}",
     )
-    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _name(row: dict[str, Any]) -> str:
+    return f"{row['robot']}, N = {row['horizon']}, {row['points']} node(s)"

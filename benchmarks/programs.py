@@ -1,5 +1,7 @@
 """QP solvers on the sparse programs of a closed loop, each from scratch.
 
+    python benchmarks/run.py --only programs --out out/bench
+
 The programs are those of scenario 1's steps, about the controller's guess and about the plan that
 ignores the obstacle. What counts is whether a solver's point holds up against the program's own
 data, and how long it took to get there from a cold start, set-up included.
@@ -11,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.progress import progress
+from benchmarks.recorded import record
+from benchmarks.tables import table
 from scp_mpc.arrays import FloatArray
-from scp_mpc.comparison.progress import progress
-from scp_mpc.comparison.sequence import record
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.qp.backend import backend
 from scp_mpc.qp.program import QuadraticProgram
@@ -49,13 +52,13 @@ def rows(steps: int) -> list[dict[str, Any]]:
         return [_row(name, programs, advance) for name in SOLVERS]
 
 
-def markdown(table: Sequence[dict[str, Any]]) -> str:
+def markdown(found: Sequence[dict[str, Any]]) -> str:
     """The table in Markdown."""
-    head = (
-        "| QP solver | Programs | Solved to 1e-6 | No point | Median residual | Median [ms] "
-        "| p99 [ms] | Max [ms] |\n|:--|--:|--:|--:|--:|--:|--:|--:|"
+    names = (
+        "QP solver | Programs | Solved to 1e-6 | No point | Median residual | Median [ms] "
+        "| p99 [ms] | Max [ms]"
     )
-    return "\n".join([head, *map(_line, table)])
+    return table(names, "lrrrrrrr", map(_cells, found))
 
 
 def _row(
@@ -97,9 +100,9 @@ def _solved(name: str, program: QuadraticProgram) -> tuple[FloatArray, FloatArra
     return point
 
 
-def _line(row: dict[str, Any]) -> str:
+def _cells(row: dict[str, Any]) -> list[object]:
     if row["ms"] is None:
-        return f"| {row['solver']} | {row['programs']} | not installed | | | | | |"
+        return [row["solver"], row["programs"], "not installed", *[""] * 5]
     cells = [row["solver"], row["programs"], row["solved"], row["none"]]
     cells.append("" if row["residual"] is None else f"{row['residual']:.0e}")
-    return "| " + " | ".join([*map(str, cells), *(f"{v:.2f}" for v in row["ms"])]) + " |"
+    return cells + [f"{value:.2f}" for value in row["ms"]]
