@@ -26,9 +26,9 @@ from benchmarks.wind_variants import (
     ALONE,
     CALM,
     EXACT,
-    FORESIGHT,
     MAIN,
     OTHERS,
+    PREDICTION,
     Variant,
     measures,
 )
@@ -64,7 +64,11 @@ def main(
     """
     few = min(seeds, FEW)
     plan = {"main": (MAIN, seeds), "calm": (CALM, few), "alone": (ALONE, few)}
-    plan |= {"others": (OTHERS, few), "foresight": (FORESIGHT, few), "exact": (EXACT, few)}
+    plan |= {
+        "others": (OTHERS, few),
+        "prediction": (PREDICTION, few),
+        "exact": (EXACT, few),
+    }
     store = out / f"{NAME}.jsonl"
     rows = {
         group: measured(variants, count, steps, store, workers)

@@ -48,7 +48,7 @@ from scp_mpc.obstacles import (
 )
 from scp_mpc.problem import Problem
 from scp_mpc.scp import SCP, Iterate, Plan, Status
-from scp_mpc.settings import Freshness, QPSettings, Settings
+from scp_mpc.settings import QPSettings, Settings, StalenessPolicy
 from scp_mpc.tracking import Tracker, TrackerSettings
 from scp_mpc.trajectory import Trajectory
 
@@ -68,7 +68,6 @@ __all__ = [
     "DisturbanceEstimator",
     "Disturbed",
     "DoubleIntegrator",
-    "Freshness",
     "FunctionModel",
     "GeometryError",
     "InvalidArgumentError",
@@ -97,6 +96,7 @@ __all__ = [
     "SpeedLimits",
     "StageRisk",
     "StaleDataError",
+    "StalenessPolicy",
     "Status",
     "TooManyObstaclesError",
     "Tracker",

@@ -130,7 +130,9 @@ _Layout = Annotated[
     str | None, typer.Option(help='"obsmat" or "text"; told from the columns if not given.')
 ]
 _Noise = Annotated[float, typer.Option(help="Standard deviation of the measurements' errors [m].")]
-_Spread = Annotated[float, typer.Option(help="Factor on the standard deviations of predictions.")]
+_StdInflation = Annotated[
+    float, typer.Option(help="Factor on the standard deviations of predictions.")
+]
 
 
 @app.command()
@@ -140,13 +142,13 @@ def coverage(
     layout: _Layout = None,
     noise: _Noise = 0.05,
     seed: Annotated[int, typer.Option(help="Seed of the errors.")] = 0,
-    spread: _Spread = 1.0,
+    std_inflation: _StdInflation = 1.0,
     json: Annotated[Path | None, typer.Option(help="File for the numbers.")] = None,
     figure: Annotated[Path | None, typer.Option(help="File for the figure, PNG.")] = None,
 ) -> None:
     """Count how often recorded people are where the tracker said that they would be."""
     with _one_line_errors():
-        settings = TrackerSettings(spread=spread)
+        settings = TrackerSettings(std_inflation=std_inflation)
         recording = _recording(file, rate, layout)
         with tqdm(total=len(recording.times), unit="frame") as bar:
             found = measure_coverage(
@@ -190,7 +192,7 @@ def replay(
     obstacles: Annotated[int, typer.Option(help="How many of the nearest people count.")] = 20,
     noise: _Noise = 0.05,
     seed: Annotated[int, typer.Option(help="Seed of the errors.")] = 0,
-    spread: _Spread = 1.0,
+    std_inflation: _StdInflation = 1.0,
     steps: Annotated[
         int | None, typer.Option(help="Control steps of 0.2 s; to the recording's end.")
     ] = None,
@@ -200,7 +202,7 @@ def replay(
     with _one_line_errors():
         if (start is None) != (goal is None):
             raise InvalidArgumentError("start", "goes with a goal, and a goal with a start")
-        settings = replace(TRACKING, spread=spread)
+        settings = replace(TRACKING, std_inflation=std_inflation)
         problem = replay_problem(horizon, Containment(level), obstacles)
         recording = _recording(file, rate, layout)
         if start is not None and goal is not None:

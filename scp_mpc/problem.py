@@ -11,7 +11,7 @@
                x_min - e_i <= x_i <= x_max + e_i,  e_i >= 0
 
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Inputs are weighed
-from the model's `idle`, which is zero but for robots that hover. Bounds of states
+from the model's `equilibrium_input`, which is zero but for robots that hover. Bounds of states
 and of rates are there where they are given. Those of states give way at an exact price: where they
 can be kept, they are, and the excess e is reported where they cannot, as after a start outside
 them. Those of inputs and rates never give way; for there always to be such inputs, holding an input
@@ -274,7 +274,7 @@ class Problem:
         """Return the cost of states (N+1, nx), inputs (N, nu) and sizes s (M,), without slack."""
         error = states[1:] - x_ref[1:]
         track = np.vdot(error[:-1] @ self.Q, error[:-1]) + error[-1] @ self.Qf @ error[-1]
-        push = inputs - self.model.idle
+        push = inputs - self.model.equilibrium_input
         effort = np.vdot(push @ self.R, push)
         deviation = s - self.size.reference
         return float(track + effort + self.size.weight * (deviation @ deviation))

@@ -57,7 +57,7 @@ class QPSettings:
 
 
 @dataclass(frozen=True)
-class Freshness:
+class StalenessPolicy:
     """How old a prediction may be, and what the controller does about it.
 
     Attributes:
@@ -83,15 +83,15 @@ class Freshness:
     def __post_init__(self) -> None:
         """Check every number and word."""
         for name in ("grow_after", "stop_after", "keep", "growth"):
-            if as_number(f"freshness.{name}", getattr(self, name)) < 0:
-                raise BoundsError(f"freshness.{name}", f"{getattr(self, name)} is negative")
+            if as_number(f"staleness.{name}", getattr(self, name)) < 0:
+                raise BoundsError(f"staleness.{name}", f"{getattr(self, name)} is negative")
         if self.stop_after < self.grow_after:
-            raise BoundsError("freshness.stop_after", f"{self.stop_after} s is before grow_after")
+            raise BoundsError("staleness.stop_after", f"{self.stop_after} s is before grow_after")
         for name in ("beyond", "stamps"):
-            words = get_args(get_type_hints(Freshness)[name])
+            words = get_args(get_type_hints(StalenessPolicy)[name])
             if getattr(self, name) not in words:
                 raise InvalidArgumentError(
-                    f"freshness.{name}", f"{getattr(self, name)!r} is none of {', '.join(words)}"
+                    f"staleness.{name}", f"{getattr(self, name)!r} is none of {', '.join(words)}"
                 )
 
 
@@ -111,7 +111,7 @@ class Settings:
             long it took lately, to end later. None: take the time it takes.
         history: Whether plans keep what happened in each SCP iteration.
         qp: OSQP's settings.
-        freshness: How old predictions may be; for the controller `MPC` alone.
+        staleness: How old predictions may be; for the controller `MPC` alone.
     """
 
     tolerance: float = 1e-6
@@ -123,7 +123,7 @@ class Settings:
     deadline: float | None = None
     history: bool = False
     qp: QPSettings = field(default_factory=QPSettings)
-    freshness: Freshness = field(default_factory=Freshness)
+    staleness: StalenessPolicy = field(default_factory=StalenessPolicy)
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -138,8 +138,8 @@ class Settings:
             raise InvalidArgumentError("solver", f"{self.solver!r} is not a name")
         if not isinstance(self.qp, QPSettings):
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
-        if not isinstance(self.freshness, Freshness):
-            raise InvalidArgumentError("freshness", f"{self.freshness!r} is not a Freshness")
+        if not isinstance(self.staleness, StalenessPolicy):
+            raise InvalidArgumentError("staleness", f"{self.staleness!r} is not a StalenessPolicy")
 
 
 def require_positive(argument: str, value: float) -> None:

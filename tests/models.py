@@ -60,5 +60,5 @@ def draw(model: Model, rng: np.random.Generator, shape: tuple[int, ...] = ()):
     """States and inputs well inside what the robot may do."""
     return (
         rng.uniform(-1.2, 1.2, (*shape, model.nx)),
-        model.idle + rng.uniform(-1.0, 1.0, (*shape, model.nu)),
+        model.equilibrium_input + rng.uniform(-1.0, 1.0, (*shape, model.nu)),
     )

@@ -131,7 +131,7 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
         x, u = slice(i * nx, (i + 1) * nx), slice(at_u + i * nu, at_u + (i + 1) * nu)
         P[x, x] = 2 * (problem.Qf if i == N - 1 else problem.Q)
         P[u, u] = 2 * problem.R
-        q[u] = -2 * problem.R @ model.idle
+        q[u] = -2 * problem.R @ model.equilibrium_input
     for j in range(moving):
         P[at_s + j, at_s + j] = 2 * size.weight
         q[at_s + j] = -2 * size.weight * size.reference

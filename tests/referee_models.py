@@ -81,7 +81,7 @@ class ModelReferee:
             lower.append(np.broadcast_to(low, row.numel()))
             upper.append(np.broadcast_to(high, row.numel()))
 
-        previous, idle = casadi.DM(x0), casadi.DM(model.idle)
+        previous, idle = casadi.DM(x0), casadi.DM(model.equilibrium_input)
         for i in range(N):
             error = X[:, i] - casadi.DM(x_ref[i + 1])
             cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(

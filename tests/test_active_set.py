@@ -31,25 +31,27 @@ def program(seed, n=12, more=0, K=6, far=False):
     return CondensedQP(F, lower, upper, A, b, np.linalg.inv(F[:n]), least=0.7)
 
 
-def yielding(p, cap):
+def relaxable(p, l1_weight):
     """The same program with half-spaces that yield at a force."""
-    return replace(p, cap=np.concatenate([np.full(len(p.F), np.inf), np.full(len(p.b), cap)]))
+    return replace(
+        p, l1_weight=np.concatenate([np.full(len(p.F), np.inf), np.full(len(p.b), l1_weight)])
+    )
 
 
 def oracle(p):
     """Solve the same program with Clarabel, a slack for each constraint that yields."""
     n = p.F.shape[1]
-    cap = np.full(len(p.F) + len(p.b), np.inf) if p.cap is None else p.cap
-    soft = np.isfinite(cap)
+    l1_weight = np.full(len(p.F) + len(p.b), np.inf) if p.l1_weight is None else p.l1_weight
+    soft = np.isfinite(l1_weight)
     k = int(soft.sum())
-    E = np.zeros((len(cap), k))
+    E = np.zeros((len(l1_weight), k))
     E[soft] = np.eye(k)
     bounds, spaces = E[: len(p.F)], E[len(p.F) :]
     P = np.zeros((n + k, n + k))
     P[:n, :n] = np.eye(n)
     G = np.block([[p.F, -bounds], [-p.F, -bounds], [-p.A, -spaces], [np.zeros((k, n)), -np.eye(k)]])
     h = np.concatenate([p.upper, -p.lower, -p.b, np.zeros(k)])
-    q = np.concatenate([np.zeros(n), cap[soft]])
+    q = np.concatenate([np.zeros(n), l1_weight[soft]])
     some = np.abs(h) < 1e20
     z = qpsolvers.solve_qp(
         csc_matrix(P), q, csc_matrix(G[some]), h[some], solver="clarabel",
@@ -62,16 +64,16 @@ def check(p, solution, tolerance=1e-7):
     """The KKT conditions, spelt out."""
     rows, force, v = np.vstack([p.F, p.A]), solution.force, solution.v
     nf = len(p.F)
-    cap = np.full(len(force), np.inf) if p.cap is None else p.cap
+    l1_weight = np.full(len(force), np.inf) if p.l1_weight is None else p.l1_weight
     np.testing.assert_allclose(v, force @ rows, atol=tolerance * (1 + np.abs(force).max()))
     bounded, gap = p.F @ v, p.A @ v - p.b
     beta, push = force[:nf], force[nf:]
     assert (push >= 0).all()
-    assert (np.abs(force) <= cap * (1 + 1e-9)).all()
-    firm = np.abs(force) < cap
-    assert (bounded >= p.lower - tolerance)[firm[:nf]].all()
-    assert (bounded <= p.upper + tolerance)[firm[:nf]].all()
-    assert (gap >= -tolerance)[firm[nf:]].all()
+    assert (np.abs(force) <= l1_weight * (1 + 1e-9)).all()
+    hard = np.abs(force) < l1_weight
+    assert (bounded >= p.lower - tolerance)[hard[:nf]].all()
+    assert (bounded <= p.upper + tolerance)[hard[:nf]].all()
+    assert (gap >= -tolerance)[hard[nf:]].all()
     # Who pushes stands at its bound, or beyond it where it yields.
     at_lower, at_upper = bounded - p.lower, p.upper - bounded
     assert (at_lower[beta > 1e-9] < tolerance).all()
@@ -97,12 +99,12 @@ def test_agrees_with_another_solver(seed, sizes):
 
 @given(seed=SEEDS)
 def test_bounds_may_yield_while_half_spaces_do_not(seed):
-    """Some bounds are out of reach; what they pay is their distance times their cap."""
+    """Some bounds are out of reach; what they pay is their distance times their l1_weight."""
     p, rng = program(seed), np.random.default_rng(seed)
     soft = np.arange(12) % 3 == 0
     shift = np.where(soft, rng.choice([-4.0, 4.0], 12), 0.0)
-    cap = np.where(np.concatenate([soft, np.zeros(6, bool)]), 1.5, np.inf)
-    p = replace(p, lower=p.lower + shift, upper=p.upper + shift, cap=cap)
+    l1_weight = np.where(np.concatenate([soft, np.zeros(6, bool)]), 1.5, np.inf)
+    p = replace(p, lower=p.lower + shift, upper=p.upper + shift, l1_weight=l1_weight)
     solution = cold(p).solution
     assert solution is not None
     check(p, solution)
@@ -117,27 +119,29 @@ def test_bounds_may_yield_while_half_spaces_do_not(seed):
 @given(seed=SEEDS)
 def test_yields_like_an_exact_l1_penalty(seed):
     p = program(seed)
-    tight = yielding(replace(p, b=p.b + 2.0), 3.0)
+    tight = relaxable(replace(p, b=p.b + 2.0), 3.0)
     solution = cold(tight).solution
     assert solution is not None
     check(tight, solution)
     np.testing.assert_allclose(solution.v, oracle(tight), atol=1e-3)
 
 
-@pytest.mark.parametrize("cap", [None, 3.0])
-def test_any_guess_leads_to_the_same_point_and_the_right_one_at_once(cap):
+@pytest.mark.parametrize("l1_weight", [None, 3.0])
+def test_any_guess_leads_to_the_same_point_and_the_right_one_at_once(l1_weight):
     rng, p = np.random.default_rng(0), program(3)
-    p = p if cap is None else yielding(replace(p, b=p.b + 2.0), cap)
+    p = p if l1_weight is None else relaxable(replace(p, b=p.b + 2.0), l1_weight)
     reference = cold(p).solution
     for _ in range(50):
         guess = rng.integers(-1, 2, 18)
         guess[12:] = -np.abs(guess[12:])
-        capped = np.zeros(18, dtype=bool) if cap is None else (guess != 0) & (rng.random(18) < 0.3)
-        capped[:12] = False
-        warm = settled(p, guess, capped, PLENTY).solution
+        relaxed = (
+            np.zeros(18, dtype=bool) if l1_weight is None else (guess != 0) & (rng.random(18) < 0.3)
+        )
+        relaxed[:12] = False
+        warm = settled(p, guess, relaxed, PLENTY).solution
         np.testing.assert_allclose(warm.v, reference.v, atol=1e-9)
         np.testing.assert_allclose(warm.force, reference.force, atol=1e-7)
-    again = settled(p, reference.active, reference.capped, 0)
+    again = settled(p, reference.active, reference.relaxed, 0)
     assert again.systems == 1
     np.testing.assert_array_equal(again.solution.v, reference.v)
     np.testing.assert_array_equal(again.solution.active, reference.active)
@@ -150,7 +154,7 @@ def test_one_wrong_constraint_is_repaired(seed, sizes):
     guess = right.active.copy()
     k = rng.integers(len(guess))
     guess[k] = 0 if guess[k] else -1
-    end = settled(p, guess, right.capped, PLENTY)
+    end = settled(p, guess, right.relaxed, PLENTY)
     assert end.solution is not None
     np.testing.assert_allclose(end.solution.v, right.v, atol=1e-8)
 
@@ -187,10 +191,10 @@ def test_solving_on_a_set_is_the_nearest_point_of_its_equations(seed, k):
 
 
 def test_capped_constraints_push_with_their_cap_wherever_they_are():
-    p = yielding(program(1), 2.0)
-    active, capped = np.zeros(18, dtype=np.intp), np.zeros(18, dtype=bool)
-    active[[0, 13, 14]], capped[[13, 14]] = [1, -1, -1], True
-    solution = solve_on(p, active, capped)
+    p = relaxable(program(1), 2.0)
+    active, relaxed = np.zeros(18, dtype=np.intp), np.zeros(18, dtype=bool)
+    active[[0, 13, 14]], relaxed[[13, 14]] = [1, -1, -1], True
+    solution = solve_on(p, active, relaxed)
     assert (solution.force[[13, 14]] == 2.0).all()
     assert p.F[0] @ solution.v == pytest.approx(p.upper[0])
     np.testing.assert_array_equal(solution.indices, [0])
@@ -208,10 +212,10 @@ def test_what_cannot_be_met_has_no_solution_unless_it_yields():
         end = cold(opposed(seed))
         assert end.solution is None
         assert end.infeasible
-        soft = yielding(opposed(seed), 50.0)
+        soft = relaxable(opposed(seed), 50.0)
         solution = cold(soft).solution
         check(soft, solution)
-        assert solution.capped.sum() >= 1
+        assert solution.relaxed.sum() >= 1
 
 
 @given(seed=SEEDS, times=st.integers(2, 4))
@@ -252,11 +256,11 @@ def test_holds_sees_wrong_forces_and_broken_constraints():
     assert not holds(p, replace(solution, v=beyond), 1e-8)
 
 
-@pytest.mark.parametrize("cap", [np.inf, 1e3])
-def test_nothing_to_do(cap):
+@pytest.mark.parametrize("l1_weight", [np.inf, 1e3])
+def test_nothing_to_do(l1_weight):
     p = program(0)
     free = replace(p, lower=p.lower - 1, upper=p.upper + 1, A=np.zeros((0, 12)), b=np.zeros(0))
-    end = cold(yielding(free, cap))
+    end = cold(relaxable(free, l1_weight))
     assert end.systems == 1
     assert not end.solution.v.any()
     assert not end.solution.force.any()
@@ -273,18 +277,20 @@ def test_garbage_for_a_guess_ends_without_a_solution_or_with_the_right_one():
 # Bounds of the optimum, and proofs that there is none
 
 
-@given(seed=SEEDS, scale=st.sampled_from([1e-3, 1.0, 1e3]), cap=st.sampled_from([None, 0.3, 3.0]))
-def test_no_multipliers_bound_the_optimum_from_above(seed, scale, cap):
+@given(
+    seed=SEEDS, scale=st.sampled_from([1e-3, 1.0, 1e3]), l1_weight=st.sampled_from([None, 0.3, 3.0])
+)
+def test_no_multipliers_bound_the_optimum_from_above(seed, scale, l1_weight):
     """Whatever the forces, of any sign, the bound is below the optimum, and at the solution it."""
     p, rng = program(seed, 8, 3, 4), np.random.default_rng(seed)
-    p = p if cap is None else yielding(replace(p, b=p.b + 1.0), cap)
+    p = p if l1_weight is None else relaxable(replace(p, b=p.b + 1.0), l1_weight)
     optimum = p.merit(oracle(p))
     for share in (1.0, 0.3):
         force = scale * rng.normal(size=15) * (rng.random(15) < share)
         assert p.dual_bound(force) <= optimum + 1e-7 * max(1.0, optimum)
     solution = cold(p).solution
     assert p.dual_bound(solution.force) == pytest.approx(optimum, rel=1e-6)
-    for stretched in (0.5, 1e-3) if cap is None else (0.5,):
+    for stretched in (0.5, 1e-3) if l1_weight is None else (0.5,):
         assert p.dual_bound(stretched * solution.force) == pytest.approx(optimum, rel=1e-6)
     assert p.dual_bound(np.zeros(15)) == p.least
 
@@ -298,17 +304,17 @@ def test_bounds_that_are_none_do_not_push():
 
 
 def farkas(p):
-    """Multipliers of the firm constraints' least violation: a proof where that is positive."""
+    """Multipliers of the hard constraints' least violation: a proof where that is positive."""
     n, nf = p.F.shape[1], len(p.F)
-    cap = np.full(nf + len(p.b), np.inf) if p.cap is None else p.cap
+    l1_weight = np.full(nf + len(p.b), np.inf) if p.l1_weight is None else p.l1_weight
     G, h = np.vstack([p.F, -p.F, -p.A]), np.concatenate([p.upper, -p.lower, -p.b])
-    firm = np.isinf(np.concatenate([cap[:nf], cap]))
-    G = np.hstack([G, -np.ones((len(G), 1))])[firm]
+    hard = np.isinf(np.concatenate([l1_weight[:nf], l1_weight]))
+    G = np.hstack([G, -np.ones((len(G), 1))])[hard]
     limits = [(None, None)] * n + [(0, None)]
-    end = linprog(np.append(np.zeros(n), 1.0), G, h[firm], bounds=limits)
+    end = linprog(np.append(np.zeros(n), 1.0), G, h[hard], bounds=limits)
     assert end.status == 0
-    y = np.zeros(len(firm))
-    y[firm] = -end.ineqlin.marginals
+    y = np.zeros(len(hard))
+    y[hard] = -end.ineqlin.marginals
     return np.concatenate([y[nf : 2 * nf] - y[:nf], y[2 * nf :]]), end.fun
 
 
@@ -326,9 +332,9 @@ def test_only_what_has_no_solution_is_proved_to_have_none(seed, shift, extra):
         assert p.proves_infeasible(proof)
         assert p.proves_infeasible(1e3 * proof)
         assert p.proves_infeasible(1e-3 * proof)
-        assert not yielding(p, 5.0).proves_infeasible(proof)
+        assert not relaxable(p, 5.0).proves_infeasible(proof)
         which = np.arange(9 + extra)  # bounds yield that are not of the box; obstacles do not
-        given_way = replace(p, cap=np.where((which >= 5) & (which < 5 + extra), 2.0, np.inf))
+        given_way = replace(p, l1_weight=np.where((which >= 5) & (which < 5 + extra), 2.0, np.inf))
         assert not (given_way.proves_infeasible(proof) and farkas(given_way)[1] < 1e-9)
 
 

@@ -59,7 +59,7 @@ def car(model, **changes):
 @pytest.mark.parametrize("model", [Unicycle(DT), KinematicBicycle(DT, 1.0)])
 def test_several_discs_between_samples_without_obstacles(model):
     problem = car(model, discs=[-0.3, 0.3], nodes_per_interval=4)
-    mpc, far = MPC(problem), ObstaclePrediction.still(3, [0.5, 0.1], 0.2)
+    mpc, far = MPC(problem), ObstaclePrediction.static(3, [0.5, 0.1], 0.2)
     x = model.state(np.zeros(2), np.array([6.0, 0.0]))
     goal = model.state(np.array([5.0, 0.0]), np.zeros(2))
     mpc.step(x, goal, [far])

@@ -138,7 +138,7 @@ def test_bad_margins_are_refused(values, message):
         {"solver": None},
         {"max_candidates": 0},
         {"deadline": 0.0},
-        {"freshness": None},
+        {"staleness": None},
         {"qp": None},
     ],
 )

@@ -37,7 +37,7 @@ def test_crowds_go_both_ways_with_a_size_each():
     assert len(predictions) == 12
     speeds = np.sign([o.angular_velocity for o in crowd.obstacles])
     assert set(speeds) == {-1.0, 1.0}
-    spread = predictions[0].spread
+    spread = predictions[0].largest_std
     assert (np.diff(spread) > 0).all()
     plan = MPC(crowd.problem()).step(crowd.start(), crowd.states(0), predictions)
     assert plan.s.shape == (12,)

@@ -6,7 +6,7 @@ from instances import S_REF, obstacle, problem, rotated, straight_reference
 from solving import half_spaces
 
 from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction, Settings
-from scp_mpc.scp.candidates import MAX_CANDIDATES, Passing, candidates, same_way
+from scp_mpc.scp.candidates import MAX_CANDIDATES, Homotopy, candidates, same_homotopy
 from scp_mpc.scp.multi_start import Present
 from scp_mpc.scp.step import Step
 
@@ -125,12 +125,12 @@ def test_the_same_way_is_the_same_stages_on_the_same_side():
     case, ref = problem(N, "exact"), straight_reference(N)
     step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
     touched = conflicts(step, ref[1:, [0, 2]], S)
-    left, right = (Passing(side.path, touched) for side in found if side.time == 0)
-    assert same_way(step, left, left)
-    assert not same_way(step, left, right)
+    left, right = (Homotopy(side.path, touched) for side in found if side.time == 0)
+    assert same_homotopy(step, left, left)
+    assert not same_homotopy(step, left, right)
     fewer = touched.copy()
     fewer[0, np.flatnonzero(touched[0])[0]] = False
-    assert not same_way(step, left, Passing(left.path, fewer))
+    assert not same_homotopy(step, left, Homotopy(left.path, fewer))
 
 
 def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():

@@ -1,4 +1,4 @@
-"""The certificate: the residual that CasADi's own derivatives give, at plans good and bad."""
+"""The certificate: the residual that CasADi's own derivatives relaxation, at plans good and bad."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -305,7 +305,7 @@ def test_the_second_derivative_is_that_of_the_rolled_out_cost(name):
     x0 = x_ref[0] + 0.3 * rng.normal(size=model.nx)
     at = Transcription(case, Settings(), Nodes.of(case))
     at.begin(Step.read(case, x0, x_ref, [], nodes=at.nodes), Clock())
-    U = case.limited(model.idle + 0.2 * rng.normal(size=(N, model.nu)))
+    U = case.limited(model.equilibrium_input + 0.2 * rng.normal(size=(N, model.nu)))
     plan = at.plain(U)
     program = at.write(plan, at.linearise(plan), plan.planes)
     here, nothing = program.condensed.here, np.zeros(len(program.qp.F), dtype=np.intp)
@@ -318,7 +318,7 @@ def test_the_second_derivative_is_that_of_the_rolled_out_cost(name):
 
     def cost(u):
         e = errors(u)
-        push = u - np.tile(model.idle, N)
+        push = u - np.tile(model.equilibrium_input, N)
         return e @ weights @ e + push @ np.kron(np.eye(N), case.R) @ push
 
     weights = np.kron(np.eye(N), case.Q)

@@ -42,7 +42,7 @@ class Bench:
             case = ride(name, RIDES[0], horizon, 0, **changes)
             self.problem, x_ref, obstacles = case.problem, case.x_ref, case.obstacles
         self.model, self.nodes = self.problem.model, Nodes.of(self.problem)
-        last = self.model.idle if self.problem.limits_rates else None
+        last = self.model.equilibrium_input if self.problem.limits_rates else None
         self.step = Step.read(
             self.problem, case.x0, x_ref, obstacles, nodes=self.nodes, u_last=last
         )
@@ -50,7 +50,7 @@ class Bench:
         self.condenser = Condenser(self.problem, self.nodes, self.layout)
         self.condenser.begin(self.step)
         self.rng = np.random.default_rng(3)
-        self.inputs = self.model.idle + 0.4 * self.rng.normal(size=self.layout.shape)
+        self.inputs = self.model.equilibrium_input + 0.4 * self.rng.normal(size=self.layout.shape)
         self.s = np.full(self.problem.max_obstacles, self.problem.size.reference)
 
     def walked(self, inputs):
@@ -85,7 +85,7 @@ def test_outputs_follow_from_walking(bench):
     np.testing.assert_allclose(rolled.positions + bench.step.here, points, atol=1e-11)
     np.testing.assert_allclose(rolled.deviations, states[1:] - bench.step.x_ref[1:], atol=1e-11)
     y, layout = bench.outputs(bench.inputs), bench.layout
-    before = np.concatenate([[model.idle], bench.inputs[:-1]])
+    before = np.concatenate([[model.equilibrium_input], bench.inputs[:-1]])
     if bench.problem.limits_rates:
         np.testing.assert_allclose(y[layout.du], (bench.inputs - before).ravel())
     bounded = rolled.deviations[:, bench.problem.bounded_states]

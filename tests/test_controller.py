@@ -14,13 +14,13 @@ from scp_mpc import (
     MPC,
     BoundsError,
     ConcurrentUseError,
-    Freshness,
     InvalidArgumentError,
     NotFiniteError,
     ObstaclePrediction,
     Settings,
     ShapeError,
     StaleDataError,
+    StalenessPolicy,
     Status,
 )
 from scp_mpc.control.memory import ObstacleMemory
@@ -188,26 +188,26 @@ def test_even_a_brake_that_is_broken_gives_an_input_within_its_bounds(monkeypatc
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"grow_after": -0.1}, "freshness.grow_after: -0.1"),
-        ({"stop_after": NAN}, "freshness.stop_after"),
-        ({"grow_after": 2.0}, "freshness.stop_after: 1.0 s is before"),
-        ({"keep": -1}, "freshness.keep"),
-        ({"growth": -0.1}, "freshness.growth"),
-        ({"growth": "much"}, "freshness.growth"),
+        ({"grow_after": -0.1}, "staleness.grow_after: -0.1"),
+        ({"stop_after": NAN}, "staleness.stop_after"),
+        ({"grow_after": 2.0}, "staleness.stop_after: 1.0 s is before"),
+        ({"keep": -1}, "staleness.keep"),
+        ({"growth": -0.1}, "staleness.growth"),
+        ({"growth": "much"}, "staleness.growth"),
         ({"beyond": "pray"}, "'pray' is none of brake, refuse"),
-        ({"beyond": []}, "freshness.beyond"),
+        ({"beyond": []}, "staleness.beyond"),
         ({"stamps": None}, "None is none of optional, required"),
     ],
 )
 def test_bad_freshness_is_refused(values, message):
     with pytest.raises(InvalidArgumentError, match=message):
-        Freshness(**values)
-    with pytest.raises(InvalidArgumentError, match="freshness"):
-        Settings(freshness=1.0)
+        StalenessPolicy(**values)
+    with pytest.raises(InvalidArgumentError, match="staleness"):
+        Settings(staleness=1.0)
 
 
 def test_recalling_changes_nothing_before_it_is_committed():
-    memory = ObstacleMemory(Freshness(), DT, 3)
+    memory = ObstacleMemory(StalenessPolicy(), DT, 3)
     report = ObstaclePrediction(np.zeros((N + 1, 2)), np.eye(2), 0.2, stamp=1.0, name="a")
     recall = memory.recall(1.0, [report])
     assert memory.recall(0.0, []).obstacles == ()

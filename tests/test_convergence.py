@@ -112,7 +112,7 @@ def outcome(name, kind, horizon, seed):
     """Our plan, the referee's residuals there, where it ends from there, and from the guess."""
     case = ride(name, kind, horizon, seed)
     problem = case.problem
-    guess = Trajectory(case.x_ref, np.tile(problem.model.idle, (horizon, 1)))
+    guess = Trajectory(case.x_ref, np.tile(problem.model.equilibrium_input, (horizon, 1)))
     solver = SCP(problem, Settings(multi_start=False, max_iterations=300))
     plan = solver.solve(case.x0, case.x_ref, case.obstacles, guess)
     referee = ModelReferee(

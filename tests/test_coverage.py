@@ -46,7 +46,7 @@ def test_promises_are_kept_by_people_of_the_model(model):
 
 def test_overconfidence_shows(model):
     recording, _, _ = model
-    sure = TrackerSettings(motions=(Motion(0.05),), spread=0.5)
+    sure = TrackerSettings(motions=(Motion(0.05),), std_inflation=0.5)
     for row in measure_coverage(recording, settings=sure).leads:
         assert row.nees > 5
         assert row.shares[2] < 0.8

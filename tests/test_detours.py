@@ -7,7 +7,7 @@ from instances import S_REF, problem
 
 from scp_mpc import ObstaclePrediction
 from scp_mpc.obstacles import Polytope
-from scp_mpc.scp.candidates import Passing, Walls, candidates, same_way
+from scp_mpc.scp.candidates import Homotopy, Walls, candidates, same_homotopy
 from scp_mpc.scp.step import Step
 
 N = 8
@@ -20,7 +20,7 @@ THINGS = [
         0.1,
         shape=BOX,
     ),
-    SLAB.still(N, (3.6, 0.3)),
+    SLAB.static(N, (3.6, 0.3)),
 ]
 RHO = np.array([0.15 + 0.1 + S_REF * 0.1, 0.15])
 PATH = np.stack([np.linspace(0.0, 4.0, N), np.zeros(N)], axis=1)
@@ -57,7 +57,7 @@ def test_points_within_go_straight_to_the_side_and_no_others(step, side):
 
 
 def test_out_of_one_and_of_what_comes_next():
-    boxes = [Polytope.box([1.0, 1.0]).still(N, (0.0, y)) for y in (1.1, 0.0, 2.2)]
+    boxes = [Polytope.box([1.0, 1.0]).static(N, (0.0, y)) for y in (1.1, 0.0, 2.2)]
     case = problem(N, max_obstacles=3)
     stack = Step.read(case, np.zeros(4), np.zeros(4), boxes)
     moved = Walls.of(stack, np.zeros(3), np.arange(3), slice(0, N))
@@ -112,12 +112,12 @@ def test_candidates_pass_polytopes_on_both_sides_together_and_apart(step):
 
 def test_the_two_faces_of_a_long_wall_are_two_sides():
     """Seen from its middle both lie in almost the same direction."""
-    wall = Polytope.box([0.2, 20.0]).still(N, (2.0, 0.0))
+    wall = Polytope.box([0.2, 20.0]).static(N, (2.0, 0.0))
     case = problem(N, max_obstacles=1)
     step = Step.read(case, np.zeros(4), np.zeros(4), [wall])
     touched = np.ones((1, N), dtype=bool)
     left, right, up = (
-        Passing(np.tile(p, (N, 1)), touched) for p in ([1.7, 9.0], [2.3, 9.0], [1.7, -9.0])
+        Homotopy(np.tile(p, (N, 1)), touched) for p in ([1.7, 9.0], [2.3, 9.0], [1.7, -9.0])
     )
-    assert not same_way(step, left, right)
-    assert same_way(step, left, up)
+    assert not same_homotopy(step, left, right)
+    assert same_homotopy(step, left, up)

@@ -17,7 +17,7 @@ from scp_mpc import (
     NotFiniteError,
 )
 from scp_mpc.control import DisturbanceEstimator, Regulator, WindAwareMPC, disturbed
-from scp_mpc.control.spread import PositionSpread
+from scp_mpc.control.position_covariance import PositionCovariance
 from scp_mpc.models import Disturbed
 from scp_mpc.simulation import SCENARIOS, ConstantPush, simulate
 
@@ -26,7 +26,7 @@ VELOCITIES = [1, 3]
 
 def aware(problem_, settings=None, alpha=0.85, affects=None, std=0.08, **options):
     robot = Disturbed(problem_.model, alpha, affects)
-    options = {"foresight": "none", **options}
+    options = {"prediction": "none", **options}
     return WindAwareMPC(problem_, DisturbanceEstimator(robot, std=std), settings, **options)
 
 
@@ -124,11 +124,11 @@ def test_a_constant_push_among_obstacles():
     assert other.distances.min() > 0.35
 
 
-def spread_of(foresight, horizon=30, thrift=1.0, measurement=None, std=0.08):
+def spread_of(prediction, horizon=30, terminal_input_weight=1.0, measurement=None, std=0.08):
     p = problem(horizon)
     robot = Disturbed(p.model, 0.85, VELOCITIES)
     known = DisturbanceEstimator(robot, std=std, measurement_std=0.02, measurement=measurement)
-    return PositionSpread(p, known, foresight, thrift), known, p
+    return PositionCovariance(p, known, prediction, terminal_input_weight), known, p
 
 
 @pytest.mark.parametrize("measurement", [None, [[1, 0, 0, 0], [0, 0, 1, 0]]])
@@ -168,7 +168,10 @@ def test_feedback_keeps_the_spread_small():
     assert spread_of("none")[0].along(S) is None
     assert (np.diff(wide[:, 0, 0]) > 0).all()
     # The feedback of a thriftier regulator holds less tightly.
-    assert spread_of("closed loop", thrift=100.0)[0].along(S)[30, 0, 0] > narrow[30, 0, 0]
+    assert (
+        spread_of("closed loop", terminal_input_weight=100.0)[0].along(S)[30, 0, 0]
+        > narrow[30, 0, 0]
+    )
     assert spread_of("closed loop")[0].along(2 * S)[0, 0, 0] == pytest.approx(2 * S[0, 0])
 
 
@@ -178,8 +181,8 @@ def test_spread_reaches_the_obstacles():
     things = [obstacle(8, (1.6, 0.05))]
     x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
     costs = [
-        aware(p, foresight=foresight).step(x, x_ref, things, robot_covariance=given).cost
-        for foresight, given in (
+        aware(p, prediction=prediction).step(x, x_ref, things, robot_covariance=given).cost
+        for prediction, given in (
             ("none", None),
             ("closed loop", None),
             ("open loop", None),
@@ -211,7 +214,7 @@ def test_regulator_is_the_long_horizons_plan(alpha):
 
 def test_thrift_is_the_terminal_weight_and_nothing_else():
     p = problem()
-    mpc = aware(p, thrift=100.0)
+    mpc = aware(p, terminal_input_weight=100.0)
     inner = mpc.mpc.problem
     weight = Regulator(p, inner.model, 100.0).terminal_weight()
     np.testing.assert_array_equal(inner.Qf, weight)
@@ -255,7 +258,10 @@ def test_a_second_thread_is_refused_before_anything_changes(monkeypatch):
         return update(self, y, u)
 
     p = problem()
-    mpc, twin = aware(p, foresight="closed loop"), aware(p, foresight="closed loop")
+    mpc, twin = (
+        aware(p, prediction="closed loop"),
+        aware(p, prediction="closed loop"),
+    )
     x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
     for each in (mpc, twin):
         each.step(x, x_ref)
@@ -298,10 +304,10 @@ def test_misuse_is_refused():
     p = problem()
     with pytest.raises(InvalidArgumentError, match="estimator"):
         WindAwareMPC(p, None)
-    with pytest.raises(InvalidArgumentError, match="foresight"):
-        aware(p, foresight="clairvoyant")
-    with pytest.raises(BoundsError, match="thrift"):
-        aware(p, thrift=0.0)
+    with pytest.raises(InvalidArgumentError, match="prediction"):
+        aware(p, prediction="clairvoyant")
+    with pytest.raises(BoundsError, match="terminal_input_weight"):
+        aware(p, terminal_input_weight=0.0)
     with pytest.raises(NotFiniteError):
         aware(p, std=np.nan)
     stranger = Disturbed(DoubleIntegrator(0.1))

@@ -19,13 +19,13 @@ from scp_mpc import (
     SCP,
     CovarianceError,
     DoubleIntegrator,
-    Freshness,
     InvalidArgumentError,
     NotFiniteError,
     ObstaclePrediction,
     Settings,
     ShapeError,
     StaleDataError,
+    StalenessPolicy,
     Status,
 )
 from scp_mpc.qp.backend import ProgramSolver
@@ -147,20 +147,20 @@ def test_04_late_predictions_grow_and_too_old_ones_stop_the_robot():
     mpc.reset()
     late = mpc.step(REF[0], REF, [replace(there, stamp=4.5)], time=5.0)
     assert fresh.ok
-    assert (mpc.obstacles[0].spread > there.spread).all()
+    assert (mpc.obstacles[0].largest_std > there.largest_std).all()
     assert late.cost > fresh.cost
     stale = mpc.step(REF[0], REF, [replace(there, stamp=0.0)], time=5.2)
     assert stale.status is Status.STALE
     assert not stale.ok
     np.testing.assert_allclose(stale.u0, [-3.0, 0.0])
-    refusing = MPC(case, Settings(freshness=Freshness(beyond="refuse")))
+    refusing = MPC(case, Settings(staleness=StalenessPolicy(beyond="refuse")))
     with pytest.raises(StaleDataError, match="5"):
         refusing.step(REF[0], REF, [replace(there, stamp=0.0)], time=5.0)
 
 
 def test_04_clocks_that_disagree_and_stamps_that_are_missing_are_refused():
     there = obstacle(N, (2.6, 0.05))
-    mpc = MPC(problem(N), Settings(freshness=Freshness(stamps="required")))
+    mpc = MPC(problem(N), Settings(staleness=StalenessPolicy(stamps="required")))
     for given, time_now in ((there, 1.0), (replace(there, stamp=1.0), None)):
         with pytest.raises(InvalidArgumentError):
             mpc.step(REF[0], REF, [given], time=time_now)
@@ -177,7 +177,7 @@ def test_04_what_vanishes_is_kept_and_grows():
     for k in range(1, 5):
         plan = mpc.step(REF[0], REF, [], time=0.2 * k)
         assert plan.s.shape == (1,)
-        assert (mpc.obstacles[0].spread > there.spread).all()
+        assert (mpc.obstacles[0].largest_std > there.largest_std).all()
     assert mpc.step(REF[0], REF, [], time=1.2).s.shape == (0,)
 
 

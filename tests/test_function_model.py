@@ -48,21 +48,21 @@ def test_a_discrete_function_is_its_step():
     np.testing.assert_allclose(half, (x + discrete(x, u)) / 2, atol=1e-15)
 
 
-def test_own_brake_state_and_idle_are_used():
+def test_own_stopping_input_state_and_equilibrium_are_used():
     model = FunctionModel(
         unicycle_rates,
         unicycle_slopes,
-        brake=lambda x: [-x[3], 0.0],
+        stopping_input=lambda x: [-x[3], 0.0],
         state=lambda p, v: np.concatenate([p, v], axis=-1),
-        idle=[0.5, 0.0],
+        equilibrium_input=[0.5, 0.0],
         **PLANE,
     )
-    np.testing.assert_array_equal(model.brake(np.full(4, 2.0)), [-2, 0])
+    np.testing.assert_array_equal(model.stopping_input(np.full(4, 2.0)), [-2, 0])
     np.testing.assert_array_equal(model.state(np.ones((3, 2)), np.zeros((3, 2)))[1], [1, 1, 0, 0])
-    np.testing.assert_array_equal(model.idle, [0.5, 0.0])
-    bad = FunctionModel(unicycle_rates, unicycle_slopes, brake=lambda _: [1.0], **PLANE)
-    with pytest.raises(ShapeError, match="brake"):
-        bad.brake(np.zeros(4))
+    np.testing.assert_array_equal(model.equilibrium_input, [0.5, 0.0])
+    bad = FunctionModel(unicycle_rates, unicycle_slopes, stopping_input=lambda _: [1.0], **PLANE)
+    with pytest.raises(ShapeError, match="stopping_input"):
+        bad.stopping_input(np.zeros(4))
 
 
 def test_a_wrong_jacobian_is_named():
@@ -116,8 +116,8 @@ def test_a_complex_step_through_abs_is_refused():
         ({"position": [0, 4]}, InvalidArgumentError),
         ({"heading": 4}, InvalidArgumentError),
         ({"heading": -1}, BoundsError),
-        ({"idle": [0.0]}, ShapeError),
-        ({"brake": 3.0}, InvalidArgumentError),
+        ({"equilibrium_input": [0.0]}, ShapeError),
+        ({"stopping_input": 3.0}, InvalidArgumentError),
         ({"check": (np.zeros(3), np.zeros(2))}, ShapeError),
         ({"check": (np.full(4, np.inf), np.zeros(2))}, NotFiniteError),
     ],
@@ -159,11 +159,11 @@ def test_a_linear_model_moves_and_stops_as_it_says():
     model = LinearModel(A, np.vstack([np.zeros((2, 2)), dt * np.eye(2)]), dt, [0, 1])
     x = model.state(np.array([1.0, 2.0]), np.array([3.0, -1.0]))
     np.testing.assert_allclose(x, [1, 2, 3, -1])
-    np.testing.assert_allclose(model.advance(x, model.idle)[:2], [1.3, 1.9])
+    np.testing.assert_allclose(model.advance(x, model.equilibrium_input)[:2], [1.3, 1.9])
     A = A - np.diag([0.02, 0.0, 0.0, 0.0])  # a position that leaks
     model = LinearModel(A, model.B, dt, [0, 1])
     x = model.state(np.array([1.0, 2.0]), np.array([3.0, -1.0]))
-    np.testing.assert_allclose(model.advance(x, model.idle)[:2], [1.3, 1.9])
+    np.testing.assert_allclose(model.advance(x, model.equilibrium_input)[:2], [1.3, 1.9])
     fractions = np.array([0.3, 1.0, 0.0])
     states = model.advance(x, np.ones(2), fractions)
     for fraction, state in zip(fractions, states, strict=True):

@@ -65,7 +65,7 @@ def test_active_half_planes_touch_the_no_go_sets():
 
 
 def test_walls_are_outlined_too():
-    wall = Polytope([[3.0, 5.0], [5.0, 5.0], [5.0, 9.0], [3.0, 9.0]]).still(30)
+    wall = Polytope([[3.0, 5.0], [5.0, 5.0], [5.0, 9.0], [3.0, 9.0]]).static(30)
     assert history_figure(planned(obstacle=wall)).axes[0].collections
 
 

@@ -25,7 +25,7 @@ def world(seed):
         box = Polytope.box(rng.uniform(0.3, 1.2, 2), angle=rng.uniform(0, np.pi))
         at = np.array([rng.uniform(0.9, 2 * DT * horizon + 0.3), rng.uniform(-0.6, 0.6)])
         if (box.normals @ (x0[[0, 2]] - at) - box.offsets).max() > 0.25:
-            boxes.append(box.still(horizon, at))
+            boxes.append(box.static(horizon, at))
     case = problem(horizon, max_obstacles=count, robot_radius=0.0)
     return case, x0, straight_reference(horizon), boxes
 

@@ -142,8 +142,8 @@ def test_the_brake_brings_the_position_to_rest(name, seed):
     x, _ = draw(model, np.random.default_rng(seed))
     slow = "quadrotor" in name
     for _ in range(200 if slow else 1):
-        x = model.step(x, model.brake(x))
-    drift = model.step(x, model.idle) - x
+        x = model.step(x, model.stopping_input(x))
+    drift = model.step(x, model.equilibrium_input) - x
     np.testing.assert_allclose(drift[model.position], 0.0, atol=1e-4 if slow else 1e-8)
 
 
@@ -156,11 +156,13 @@ def test_states_stand_there_and_move_so(name, seed):
     states = model.state(position, velocity)
     assert states.shape == (3, 6, model.nx)
     np.testing.assert_array_equal(states[..., model.position], position)
-    ahead = model.advance(states, model.idle, 1e-5)[..., model.position]
+    ahead = model.advance(states, model.equilibrium_input, 1e-5)[..., model.position]
     moved = (ahead - position) / (1e-5 * DT)
     np.testing.assert_allclose(moved, velocity, atol=1e-4)
     alone = model.state(position[0, 0], velocity[0, 0])
-    moved = (model.advance(alone, model.idle, 1e-5)[model.position] - position[0, 0]) / (1e-5 * DT)
+    moved = (
+        model.advance(alone, model.equilibrium_input, 1e-5)[model.position] - position[0, 0]
+    ) / (1e-5 * DT)
     np.testing.assert_allclose(moved, velocity[0, 0], atol=1e-4)
 
 
@@ -187,17 +189,19 @@ def test_the_bicycle_drives_the_circle_of_its_reference(rear):
     angle = 0.3 * DT * np.arange(20)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     states = model.state(8 * ring, 2.4 * np.stack([-ring[:, 1], ring[:, 0]], axis=-1))
-    np.testing.assert_allclose(model.advance(states[:-1], model.idle), states[1:], atol=1e-8)
+    np.testing.assert_allclose(
+        model.advance(states[:-1], model.equilibrium_input), states[1:], atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("name", OWN)
 def test_only_planar_robots_with_a_nose_have_a_heading(name):
     model = MODELS[name]
     assert model.heading == (None if "quadrotor" in name else 2)
-    assert not model.idle.flags.writeable
+    assert not model.equilibrium_input.flags.writeable
     assert not model.position.flags.writeable
     still = np.zeros(model.nx)
-    np.testing.assert_allclose(model.step(still, model.idle), still, atol=1e-15)
+    np.testing.assert_allclose(model.step(still, model.equilibrium_input), still, atol=1e-15)
 
 
 @pytest.mark.parametrize(("name", "start", "share"), [
@@ -211,9 +215,9 @@ def test_a_brake_thrusts_by_what_its_axis_has_of_the_wanted_force(name, start, s
     velocity = slice(start, start + model.dim)
     axis = (model.derivative(x, one) - model.derivative(x, still))[velocity]
     force = -x[velocity] / (share * DT) - model.derivative(x, still)[velocity]
-    assert model.brake(x)[0] == pytest.approx(axis @ force)
+    assert model.stopping_input(x)[0] == pytest.approx(axis @ force)
     far = x.copy()
     far[velocity] = 50.0
-    assert np.isfinite(model.brake(far)).all()
+    assert np.isfinite(model.stopping_input(far)).all()
     if name == "quadrotor":
-        assert model.derivative(x, model.brake(x))[8] == pytest.approx(0.0, abs=1e-12)
+        assert model.derivative(x, model.stopping_input(x))[8] == pytest.approx(0.0, abs=1e-12)

@@ -83,7 +83,7 @@ def test_the_bend_is_the_second_derivative(kind, dim):
         return spaces, np.concatenate([spaces.normal[:, 0], spaces.slope], axis=1)
 
     spaces, _ = linear(p, s)
-    L = inflation.bend(sets, s, spaces)[:, 0]
+    L = inflation.curvature_factor(sets, s, spaces)[:, 0]
     assert L.shape == (K, dim + 1, dim - 1)
     hessian, h = L @ np.swapaxes(L, 1, 2), 1e-5
     for a in range(dim + (kind is ExactInflation)):
@@ -213,7 +213,7 @@ def test_a_plan_that_is_given_up_within_an_obstacle_says_how_deep():
     at = Transcription(case.problem, Settings(), Nodes.of(case.problem))
     step = Step.read(case.problem, case.x0, case.x_ref, case.obstacles)
     at.begin(step, Clock())
-    through = at.at(at.iterate(at.unobstructed(None)))
+    through = at.at(at.iterate(at.obstacle_free_optimum(None)))
     assert not through.slack.any()
     end = Loop(at).result(through)
     positions = at.nodes.positions(end.iterate.states, end.iterate.inputs)

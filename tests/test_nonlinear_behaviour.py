@@ -166,7 +166,7 @@ def test_closed_loop_of_a_long_robot_keeps_rates_bounds_and_distance(name):
     discs = (-0.3, 0.2, 0.7)
     problem = machine_problem(name, N, nodes_per_interval=4, discs=discs, du_min=-0.6, du_max=0.6)
     model, controller = problem.model, MPC(problem)
-    x, last, obstacle = straight(model, 1)[0], model.idle, ahead((2.5, 0.15))
+    x, last, obstacle = straight(model, 1)[0], model.equilibrium_input, ahead((2.5, 0.15))
     for k in range(16):
         x_ref = straight(model, N)
         x_ref[:, 0] += 1.5 * DT * k

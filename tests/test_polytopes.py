@@ -26,7 +26,7 @@ def random_polytope(rng, dim, points=9):
 
 
 def stacked(*shapes):
-    return Polytopes.of([shape.still(1) for shape in shapes])
+    return Polytopes.of([shape.static(1) for shape in shapes])
 
 
 def nearest(shape, y):

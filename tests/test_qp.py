@@ -338,7 +338,7 @@ def test_solvers_are_set_up_once_and_never_again(name, monkeypatch):
         hard = machine_problem("unicycle", 20, max_obstacles=2, x_max=[np.inf] * 3 + [1.6])
     mpc = MPC(hard)
     before = dict(count)
-    assert before["osqp"] == 2  # the firm program and the elastic one
+    assert before["osqp"] == 2  # the hard program and the elastic one
     for present in (case.obstacles, [], case.obstacles * 2, case.obstacles):
         plan = mpc.step(case.x0, case.x_ref, present)
     plan = mpc.step(case.x0, case.x_ref, [obstacle(20, (0.3, 0.0))])
@@ -452,18 +452,18 @@ def test_rows_without_a_slot_push_nobody():
     rows = Rows(np.array([2, -1, 0]))
     y = np.array([-3.0, 5.0, 2.0])
     np.testing.assert_array_equal(rows.forces(y), [-2.0, 0.0, 3.0])
-    active, capped = rows.active(y, 0.0)
+    active, relaxed = rows.active(y, 0.0)
     np.testing.assert_array_equal(active, [1, 0, -1])
-    assert not capped.any()
+    assert not relaxed.any()
     np.testing.assert_array_equal(rows.active(y, 0.5)[0], [0, 0, -1])
 
 
 def test_a_row_yields_where_its_slack_is_not_pinned():
     place, below = np.array([0, 1]), np.array([2, 3])
     rows = Rows(place, below, np.array([-1, -1]))
-    active, capped = rows.active(np.array([-1.0, -1.0, 0.0, -0.5]), 0.0)
+    active, relaxed = rows.active(np.array([-1.0, -1.0, 0.0, -0.5]), 0.0)
     np.testing.assert_array_equal(active, [-1, -1])
-    np.testing.assert_array_equal(capped, [True, False])
+    np.testing.assert_array_equal(relaxed, [True, False])
 
 
 # The whole solver with each of them

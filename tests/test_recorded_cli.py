@@ -39,7 +39,7 @@ def test_coverage_passes_its_options_on(tmp_path):
     assert (found["noise"], found["seed"]) == (0.2, 3)
     wide = tmp_path / "wide.json"
     options[-1] = wide
-    invoke("coverage", text, *options, "--spread", 2.0)
+    invoke("coverage", text, *options, "--std-inflation", 2.0)
     wider = json.loads(wide.read_text())["leads"][0]["rms_predicted"]
     assert wider == pytest.approx(2 * found["leads"][0]["rms_predicted"])
 
@@ -80,7 +80,7 @@ def test_replay_passes_its_options_on(file, tmp_path):
         (["replay", "--layout", "csv"], "layout: 'csv'"),
         (["coverage", "--rate", -1], "rate: -1"),
         (["coverage", "--layout", "text", "--noise", "nan"], "noise: nan"),
-        (["coverage", "--spread", 0], "spread: 0"),
+        (["coverage", "--std-inflation", 0], "std_inflation: 0"),
     ],
 )
 def test_bad_value_gives_one_line(file, options, message):

@@ -15,9 +15,9 @@ def test_references_move_as_their_velocities_say(robot):
     np.testing.assert_allclose(np.linalg.norm(p, axis=1), 8.0)
     np.testing.assert_array_equal(x[1:], Circuit(robot, 8, 3).states(5)[:-1])
     chords = np.diff(p, axis=0) / model.dt
-    drift = (model.advance(x, np.tile(model.idle, (9, 1)), 1e-4)[:, model.position] - p) / (
-        1e-4 * model.dt
-    )
+    drift = (
+        model.advance(x, np.tile(model.equilibrium_input, (9, 1)), 1e-4)[:, model.position] - p
+    ) / (1e-4 * model.dt)
     np.testing.assert_allclose((drift[1:] + drift[:-1]) / 2, chords, atol=0.05)
 
 

@@ -291,9 +291,9 @@ def test_a_rival_that_breaks_down_does_not_lose_the_plan(monkeypatch):
     broken = SCP(case)
     run, calls = broken._loop.run, []
 
-    def breaking(nominal, goal=None, *about, **firm):
+    def breaking(nominal, goal=None, *about, **hard):
         calls.append(goal)
-        return run(nominal, goal, *about, **firm) if goal is None else None
+        return run(nominal, goal, *about, **hard) if goal is None else None
 
     monkeypatch.setattr(broken._loop, "run", breaking)
     plan = broken.solve(ref[0], ref, slow, guess)

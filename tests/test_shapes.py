@@ -19,7 +19,7 @@ from scp_mpc import (
     Status,
 )
 from scp_mpc.geometry import AxesInflation, ExactInflation, NoGoSets, risk_bound
-from scp_mpc.obstacles import Polytope, aged
+from scp_mpc.obstacles import Polytope, propagated
 from scp_mpc.scp.step import Step
 
 N = 5
@@ -96,14 +96,14 @@ def test_others_are_as_without_polytopes_beside_them(inflation, seed, dim):
     expected = inflation.linearise(alone, p, s[1:2], start[1:2])
     for name in ("normal", "slope", "offset", "value"):
         np.testing.assert_array_equal(getattr(spaces, name)[1], getattr(expected, name)[0])
-    bend = inflation.bend(sets, s, spaces)
-    np.testing.assert_array_equal(bend[1], inflation.bend(alone, s[1:2], expected)[0])
+    bend = inflation.curvature_factor(sets, s, spaces)
+    np.testing.assert_array_equal(bend[1], inflation.curvature_factor(alone, s[1:2], expected)[0])
     assert not bend[[0, 2], :, -1].any()
-    np.testing.assert_array_equal(bend[[0, 2], :, :dim], spaces.bend[[0, 2]])
+    np.testing.assert_array_equal(bend[[0, 2], :, :dim], spaces.curvature[[0, 2]])
     y = p - sets.means
     for j in (0, 2):
         near = sets.shapes.taken(np.array([j])).nearest(y[[j]])
-        np.testing.assert_array_equal(spaces.bend[j], near.bend[0])
+        np.testing.assert_array_equal(spaces.curvature[j], near.curvature[0])
     room = inflation.clearance(sets, p)
     np.testing.assert_array_equal(room[1], inflation.clearance(alone, p)[0])
     expected = inflation.linearise(sets, p, np.full(4, S_REF), start).value
@@ -150,7 +150,7 @@ def test_the_risk_bound_holds_for_samples(seed):
 
 
 def test_the_risk_of_a_wall_is_none_or_certain():
-    wall = Polytope.box([1.0, 1.0]).still(2)
+    wall = Polytope.box([1.0, 1.0]).static(2)
     sets = NoGoSets.from_predictions([wall], 0.2, 1, 2, 2)
     np.testing.assert_array_equal(risk_bound(sets, np.array([[0.71, 0.0], [0.69, 0.0]])), [[0, 1]])
     blurred = ObstaclePrediction(wall.means, np.diag([0.04, 0.01]), 0.0, shape=wall.shape)
@@ -161,15 +161,15 @@ def test_the_risk_of_a_wall_is_none_or_certain():
 
 def test_a_shape_belongs_to_its_prediction():
     box = Polytope.box([1.0, 2.0])
-    wall = box.still(N, at=(1.0, 2.0), radius=0.1, name="wall")
+    wall = box.static(N, at=(1.0, 2.0), radius=0.1, name="wall")
     np.testing.assert_array_equal(wall.means, [[1.0, 2.0]] * (N + 1))
     assert not wall.covariances.any()
     assert (wall.shape, wall.name, wall.radius, wall.stamp) == (box, "wall", 0.1, None)
-    late = aged(wall, 0.3, DT, 0.5)
+    late = propagated(wall, 0.3, DT, 0.5)
     assert late.shape is box
     np.testing.assert_allclose(late.covariances, [0.15 * np.eye(2)] * (N + 1))
-    pillar = ObstaclePrediction.still(N, (0.0, 1.0, 2.0), 0.3)
-    assert (pillar.dim, pillar.shape, pillar.spread.max()) == (3, None, 0.0)
+    pillar = ObstaclePrediction.static(N, (0.0, 1.0, 2.0), 0.3)
+    assert (pillar.dim, pillar.shape, pillar.largest_std.max()) == (3, None, 0.0)
     with pytest.raises(ShapeError, match="shape"):
         ObstaclePrediction(np.zeros((3, 3)), np.eye(3), 0.1, shape=box)
     with pytest.raises(InvalidArgumentError, match="shape"):
@@ -189,10 +189,10 @@ WALL = Polytope.box([0.4, 3.0])
 BENT = Polytope.box([0.8, 2.6], angle=0.3)
 TRIANGLE = Polytope([[-0.6, -0.5], [0.7, -0.3], [0.1, 0.8]])
 WORLDS = {
-    "box": [Polytope.box([1.0, 0.8], angle=0.4).still(HORIZON, (4.0, 0.1))],
-    "rounded": [TRIANGLE.still(HORIZON, (4.0, -0.2), radius=0.3)],
-    "slalom": [WALL.still(HORIZON, (2.5, -1.3)), BENT.still(HORIZON, (5.5, 1.3))],
-    "door": [WALL.still(HORIZON, (4.0, -1.4)), WALL.still(HORIZON, (4.0, 2.4))],
+    "box": [Polytope.box([1.0, 0.8], angle=0.4).static(HORIZON, (4.0, 0.1))],
+    "rounded": [TRIANGLE.static(HORIZON, (4.0, -0.2), radius=0.3)],
+    "slalom": [WALL.static(HORIZON, (2.5, -1.3)), BENT.static(HORIZON, (5.5, 1.3))],
+    "door": [WALL.static(HORIZON, (4.0, -1.4)), WALL.static(HORIZON, (4.0, 2.4))],
 }
 
 
@@ -228,7 +228,7 @@ def test_ipopt_does_not_improve_a_plan_around_an_uncertain_one():
 def test_a_corridor_with_somebody_in_it():
     """Two walls 2.4 m apart; who comes towards the robot leaves room on one side only."""
     side = Polytope.box([12.0, 0.2])
-    walls = [side.still(HORIZON, (4.0, y)) for y in (-1.3, 1.3)]
+    walls = [side.static(HORIZON, (4.0, y)) for y in (-1.3, 1.3)]
     person = obstacle(HORIZON, (6.0, 0.35), (-1.0, 0.0), 0.01 * np.eye(2))
     case = problem(HORIZON, max_obstacles=3, nodes_per_interval=4)
     plan = certified(case, REF[0], REF, [*walls, person])
@@ -251,7 +251,7 @@ def test_a_polyhedron_in_space():
     ref = np.pad(REF, ((0, 0), (0, 2)))
     points = np.random.default_rng(2).normal(size=(12, 3))
     thing = Polytope(0.8 * points / np.linalg.norm(points, axis=1, keepdims=True))
-    still = thing.still(HORIZON, (4.0, 0.1, -0.1), radius=0.05)
+    still = thing.static(HORIZON, (4.0, 0.1, -0.1), radius=0.05)
     plan = certified(case, ref[0], ref, [still])
     assert plan.iterate.touches
     assert -1e-6 < clearance(case, plan, [still], pieces=4) < 0.1
@@ -264,9 +264,9 @@ def test_a_disc_is_a_polygon_with_many_corners():
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     disc = Polytope(0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     case = problem(HORIZON)
-    round_one = ObstaclePrediction.still(HORIZON, (4.0, 0.1), 0.5)
+    round_one = ObstaclePrediction.static(HORIZON, (4.0, 0.1), 0.5)
     expected = certified(case, REF[0], REF, [round_one])
-    plan = certified(case, REF[0], REF, [disc.still(HORIZON, (4.0, 0.1))])
+    plan = certified(case, REF[0], REF, [disc.static(HORIZON, (4.0, 0.1))])
     assert plan.cost == pytest.approx(expected.cost, rel=2e-3)
 
 
@@ -287,7 +287,7 @@ def test_the_robots_own_uncertainty_keeps_it_off_the_wall():
 def test_a_robot_drives_through_doors():
     """In closed loop, with the last plan as a guess, without touching."""
     case = problem(HORIZON, max_obstacles=3, nodes_per_interval=4)
-    walls = [*WORLDS["door"], WALL.still(HORIZON, (7.5, 0.8), name="third")]
+    walls = [*WORLDS["door"], WALL.static(HORIZON, (7.5, 0.8), name="third")]
     mpc, x = MPC(case), REF[0].copy()
     for k in range(12):
         ref = REF.copy()

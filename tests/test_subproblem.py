@@ -98,7 +98,7 @@ def test_equals_the_dense_rebuild(case, nodes_per_interval, elastic):
 @BOTH
 def test_equals_the_dense_rebuild_about_polytopes(elastic):
     this, x0, x_ref, things = linear()
-    walls = [Polytope.box([0.4, 0.3], angle=0.3).still(N, [0.6, 0.5]), things[0]]
+    walls = [Polytope.box([0.4, 0.3], angle=0.3).static(N, [0.6, 0.5]), things[0]]
     plan = about(this, x0)
     program = SCP(this).subproblem(x0, x_ref, walls, guess=plan, elastic=elastic)
     couplings = couplings_of(program, this) if elastic else None
@@ -109,7 +109,7 @@ def test_equals_the_dense_rebuild_about_polytopes(elastic):
 def test_the_nearest_obstacles_get_the_slots_and_others_none(case):
     this, x0, x_ref, _ = CASES[case]()
     this, rng = replace(this, max_obstacles=5), np.random.default_rng(3)
-    things = [ObstaclePrediction.still(N, 0.4 * rng.normal(size=2), 0.2) for _ in range(5)]
+    things = [ObstaclePrediction.static(N, 0.4 * rng.normal(size=2), 0.2) for _ in range(5)]
     plan, solver = about(this, x0), SCP(this)
     begin = rebuilt(this, x0, x_ref, [], plan.inputs).spaces.start
     for present in (things, things[:4], things[:2], [far_away(), *things[:1]]):
@@ -132,7 +132,7 @@ def test_the_nearest_obstacles_get_the_slots_and_others_none(case):
 
 
 def far_away():
-    return ObstaclePrediction.still(N, [50.0, 50.0], 0.2)
+    return ObstaclePrediction.static(N, [50.0, 50.0], 0.2)
 
 
 def test_no_zero_is_stored_in_the_hessian():
@@ -203,7 +203,7 @@ def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
     if not plan.ok:
         return
     value = z @ (program.P @ z) / 2 + program.q @ z
-    idle, size = case.problem.model.idle, case.problem.size
+    idle, size = case.problem.model.equilibrium_input, case.problem.size
     constant = 8 * idle @ case.problem.R @ idle
     if size.lower < size.reference:
         constant += size.weight * size.reference**2
@@ -239,11 +239,11 @@ def begun(case="bounds", **changes):
     return at, at.nominal(y, rolled, reaction, pairs, force)
 
 
-@pytest.mark.parametrize("give", list(Relaxation))
+@pytest.mark.parametrize("relaxation", list(Relaxation))
 @pytest.mark.parametrize("case", ["plane", "bounds", "bicycle"])
-def test_a_start_and_what_is_read_from_it_are_inverse(case, give):
+def test_a_start_and_what_is_read_from_it_are_inverse(case, relaxation):
     at, nominal = begun(case)
-    program = at.write(nominal, at.linearise(nominal), nominal.planes, give)
+    program = at.write(nominal, at.linearise(nominal), nominal.planes, relaxation)
     rows, (z, y) = program.rows, at.start(program, nominal)
     nx, nu = at.problem.model.nx, at.problem.model.nu
     deviations, inputs, rest = np.split(z, [N * nx, N * (nx + nu)])
@@ -292,7 +292,7 @@ def test_the_objective_is_the_problems_cost(case):
     moving = size.lower < size.reference
     s = s if moving else np.full(2, size.reference)
     z = np.concatenate([(plan.states - x_ref)[1:].ravel(), plan.inputs.ravel(), s[: 2 * moving]])
-    constant = N * this.model.idle @ this.R @ this.model.idle
+    constant = N * this.model.equilibrium_input @ this.R @ this.model.equilibrium_input
     constant += 2 * moving * size.weight * size.reference**2
     value = z @ (program.P @ z) / 2 + program.q @ z + constant
     assert len(z) == len(program.q) == N * (this.model.nx + nu) + 2 * moving

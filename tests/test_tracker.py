@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scp_mpc import MPC, DoubleIntegrator, Freshness, ObstaclePrediction, Problem, Settings
+from scp_mpc import MPC, DoubleIntegrator, ObstaclePrediction, Problem, Settings, StalenessPolicy
 from scp_mpc.errors import (
     BoundsError,
     CovarianceError,
@@ -14,7 +14,7 @@ from scp_mpc.errors import (
 )
 from scp_mpc.tracking import WALKING_AND_TURNING, Motion, Tracker, TrackerSettings
 
-CERTAIN = TrackerSettings(confirm=1)
+CERTAIN = TrackerSettings(confirmations=1)
 
 
 def tracker(settings=None, **changes):
@@ -36,9 +36,9 @@ def test_a_walk_is_predicted():
     assert ann.stamp == pytest.approx(7.6)
     walk = np.stack([9.12 + 1.2 * 0.2 * np.arange(11), np.ones(11)], axis=1)
     assert np.abs(ann.means - walk).max() < 0.02
-    assert (np.diff(ann.spread) > 0).all()
+    assert (np.diff(ann.largest_std) > 0).all()
     eigenvalues = np.linalg.eigvalsh(ann.covariances)
-    assert np.allclose(ann.spread, np.sqrt(eigenvalues[:, -1]))
+    assert np.allclose(ann.largest_std, np.sqrt(eigenvalues[:, -1]))
     assert not ann.means.flags.writeable
 
 
@@ -58,18 +58,18 @@ def test_dropouts_cost_certainty_and_tracks_end():
         follower.update(0.2 * k, [[0.2 * k, 0], [0, 5]], ["a", "b"])
     follower.update(1.0, [[1.0, 0]], ["a"])
     a, b = follower.predictions()
-    assert b.spread[0] > a.spread[0]
+    assert b.largest_std[0] > a.largest_std[0]
     follower.update(1.7, [[1.7, 0]], ["a"])
     assert [o.name for o in follower.predictions()] == ["a", "b"]  # 0.9 s without
     assert [o.name for o in follower.predictions(1.9)] == ["a"]
     follower.update(1.9, [], [])
     assert follower.names == ("a",)
     follower.update(2.0, [[0, 5]], ["b"])
-    assert follower.predictions()[1].spread[-1] > 1.0  # b begins anew: its speed is not known
+    assert follower.predictions()[1].largest_std[-1] > 1.0  # b begins anew: its speed is not known
 
 
 def test_tracks_are_told_of_once_confirmed():
-    follower = tracker(TrackerSettings(confirm=3))
+    follower = tracker(TrackerSettings(confirmations=3))
     for k, told in enumerate([0, 0, 1, 1]):
         follower.update(0.1 * k, [[0.0, 0.0]], [0])
         assert len(follower.predictions()) == told
@@ -152,11 +152,11 @@ def test_nobody_at_all():
 
 
 def test_spread_widens_and_moves_nothing():
-    plain, wide = tracker(), tracker(TrackerSettings(spread=1.5))
+    plain, wide = tracker(), tracker(TrackerSettings(std_inflation=1.5))
     for k in range(3):
         for follower in (plain, wide):
             follower.update(0.2 * k, [[0.2 * k, 0]], [0])
-    assert np.allclose(wide.predictions()[0].spread, 1.5 * plain.predictions()[0].spread)
+    assert np.allclose(wide.predictions()[0].largest_std, 1.5 * plain.predictions()[0].largest_std)
     assert np.array_equal(wide.predictions()[0].means, plain.predictions()[0].means)
 
 
@@ -227,12 +227,12 @@ def test_bad_trackers_are_refused(changes, error):
         ({"motions": ()}, InvalidArgumentError),
         ({"motions": [Motion(0.1)]}, InvalidArgumentError),
         ({"motions": (0.1,)}, InvalidArgumentError),
-        ({"sojourn": 0.0}, BoundsError),
+        ({"dwell_time": 0.0}, BoundsError),
         ({"speed": -1.0}, BoundsError),
-        ({"confirm": 0}, BoundsError),
+        ({"confirmations": 0}, BoundsError),
         ({"keep": -1.0}, BoundsError),
         ({"gate": 1.0}, BoundsError),
-        ({"spread": float("nan")}, NotFiniteError),
+        ({"std_inflation": float("nan")}, NotFiniteError),
     ],
 )
 def test_bad_settings_are_refused(changes, error):
@@ -245,7 +245,7 @@ def test_the_controller_takes_the_predictions():
         DoubleIntegrator(0.2), horizon=10, Q=[1, 0.1, 1, 0.1], R=[0.1, 0.1], u_min=-3, u_max=3,
         robot_radius=0.3, max_obstacles=3, nodes_per_interval=1,
     )  # fmt: skip
-    mpc = MPC(problem, Settings(freshness=Freshness(stamps="required", keep=0)))
+    mpc = MPC(problem, Settings(staleness=StalenessPolicy(stamps="required", keep=0)))
     follower = tracker()
     for k in range(4):
         follower.update(0.4 * k, [[5.0 - 0.4 * k, 0.1]], ["a"])

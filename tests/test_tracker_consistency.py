@@ -10,7 +10,7 @@ from scp_mpc.tracking.kalman import mahalanobis
 PEOPLE, STD, DT, LEADS = 400, 0.05, 0.4, 12
 CV = TrackerSettings(motions=(Motion(0.05),), speed=1.0)
 TURNS = TrackerSettings(
-    motions=(Motion(0.005), Motion(0.005, 0.8, 0.5), Motion(0.005, -0.8, 0.5)), sojourn=4.0
+    motions=(Motion(0.005), Motion(0.005, 0.8, 0.5), Motion(0.005, -0.8, 0.5)), dwell_time=4.0
 )
 
 
@@ -94,7 +94,7 @@ def test_ellipses_hold_what_they_promise():
 def test_switching_motions_are_as_far_off_as_predicted():
     """Mixtures are no Gaussians, so ellipses hold other shares; but Sigma is their covariance."""
     rng = np.random.default_rng(11)
-    true = truths(TURNS.motions, np.full(12 + LEADS, DT), rng, TURNS.sojourn)
+    true = truths(TURNS.motions, np.full(12 + LEADS, DT), rng, TURNS.dwell_time)
     squares, _ = foreseen(followed(TURNS, true[:13], np.full(12, DT), rng), true[12:])
     error = squares.std(axis=1) / np.sqrt(PEOPLE)
     assert (np.abs(squares.mean(axis=1) - 2) < 4 * error).all()

@@ -10,10 +10,10 @@ from benchmarks.wind_variants import (
     BEST,
     CALM,
     EXACT,
-    FORESIGHT,
     MAIN,
     NOMINAL,
     OTHERS,
+    PREDICTION,
     REPORT,
     Variant,
     measures,
@@ -21,9 +21,9 @@ from benchmarks.wind_variants import (
 
 
 def test_variants_are_all_different_and_named_so():
-    variants = [*MAIN, *CALM, *ALONE, *FORESIGHT, *OTHERS, *EXACT]
+    variants = [*MAIN, *CALM, *ALONE, *PREDICTION, *OTHERS, *EXACT]
     assert len({variant.name for variant in variants}) == len(variants)
-    assert (MAIN[0].horizon, MAIN[0].rejects, MAIN[0].thrift) == (30, False, None)
+    assert (MAIN[0].horizon, MAIN[0].rejects, MAIN[0].terminal_input_weight) == (30, False, None)
     assert all(row.disturbance == "report's wind" for row in MAIN)
 
 
@@ -42,8 +42,12 @@ def test_all_variants_meet_the_same_wind():
 def test_without_a_disturbance_rejection_is_no_worse():
     """Long enough to pass the obstacle, for which an N of 8 is short."""
     nominal, plain, best = (
-        measures(Variant(8, rejects, "none", thrift), 0, 100)
-        for rejects, thrift in ((False, None), (True, None), (True, BEST.thrift))
+        measures(Variant(8, rejects, "none", terminal_input_weight), 0, 100)
+        for rejects, terminal_input_weight in (
+            (False, None),
+            (True, None),
+            (True, BEST.terminal_input_weight),
+        )
     )
     assert nominal["rms"] > 0.5
     assert plain["rms"] == pytest.approx(nominal["rms"], abs=1e-6)

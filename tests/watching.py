@@ -1,4 +1,4 @@
-"""Controllers and reports with stamps and names, for the tests of freshness."""
+"""Controllers and reports with stamps and names, for the tests of staleness."""
 
 from dataclasses import replace
 
@@ -8,15 +8,15 @@ from instances import obstacle, problem, straight_reference
 
 from scp_mpc import (
     MPC,
-    Freshness,
     Settings,
+    StalenessPolicy,
 )
 
 NAN = np.nan
 
 
 def settings(**changes):
-    return Settings(freshness=Freshness(**changes))
+    return Settings(staleness=StalenessPolicy(**changes))
 
 
 def seen(stamp=None, name=None, at=(3.0, 0.1), velocity=(0.3, 0.0)):

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import InvalidArgumentError, StaleDataError
-from scp_mpc.obstacles.ageing import aged
 from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
-from scp_mpc.settings import Freshness
+from scp_mpc.obstacles.propagation import propagated
+from scp_mpc.settings import StalenessPolicy
 
 _log = logging.getLogger(__name__)
 
@@ -59,14 +59,14 @@ class ObstacleMemory:
     An obstacle without a name cannot be told from another one, so it is not kept.
 
     Args:
-        freshness: How old is too old, and how fast uncertainty grows.
+        staleness: How old is too old, and how fast uncertainty grows.
         dt: Interval of the predictions and of steps without a given time [s].
         slots: Most obstacles that a step can be planned with.
     """
 
-    def __init__(self, freshness: Freshness, dt: float, slots: int) -> None:
+    def __init__(self, staleness: StalenessPolicy, dt: float, slots: int) -> None:
         """Start with nothing known, at no time."""
-        self._freshness = freshness
+        self._freshness = staleness
         self._dt = dt
         self._slots = slots
         self.reset()
@@ -122,7 +122,7 @@ class ObstacleMemory:
         last = self._time
         if time is None:
             if required:
-                raise StaleDataError("time", "missing, but freshness.stamps is 'required'")
+                raise StaleDataError("time", "missing, but staleness.stamps is 'required'")
             return 0.0 if last is None else last + self._dt
         now = as_number("time", time)
         if last is not None and now < last - _TICK:
@@ -135,7 +135,7 @@ class ObstacleMemory:
         if stamp is None:
             if required:
                 raise StaleDataError(
-                    f"obstacles[{j}].stamp", "missing, but freshness.stamps is 'required'"
+                    f"obstacles[{j}].stamp", "missing, but staleness.stamps is 'required'"
                 )
             return now
         if stamp - now > self._freshness.grow_after + self._dt + _TICK:
@@ -172,7 +172,7 @@ class ObstacleMemory:
         """The prediction moved on to the present, unless it is younger than `late` seconds."""
         if now - since <= late + _TICK:
             return prediction
-        return aged(prediction, now - since, self._dt, self._freshness.growth)
+        return propagated(prediction, now - since, self._dt, self._freshness.growth)
 
     def _stale(
         self, given: tuple[ObstaclePrediction, ...], since: list[float], now: float

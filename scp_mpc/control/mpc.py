@@ -45,7 +45,7 @@ class MPC:
         """Set up the solver; there is no plan yet."""
         self._solver = SCP(problem, settings)
         self._memory = ObstacleMemory(
-            self.settings.freshness, problem.model.dt, problem.max_obstacles
+            self.settings.staleness, problem.model.dt, problem.max_obstacles
         )
         self._busy = Lock()
         self._counts: Counter[Status] = Counter()
@@ -104,7 +104,7 @@ class MPC:
             x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
             obstacles: At most `max_obstacles` predictions over the same horizon. What happens to
                 late ones, and to named ones that are no longer given, is said by
-                `settings.freshness`.
+                `settings.staleness`.
             time: Now [s], on the clock of the predictions' stamps; None for one interval after the
                 last step that returned a plan, or 0 at the first.
             robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2].
@@ -166,7 +166,7 @@ class MPC:
                 *(x0, x_ref, recall.obstacles, self.nominal(), due),
                 *(robot_covariance, clock, last),
             )
-        if self.settings.freshness.beyond == "refuse":
+        if self.settings.staleness.beyond == "refuse":
             raise recall.stale
         # Bad arguments are refused before the robot brakes.
         Step.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)

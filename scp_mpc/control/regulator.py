@@ -27,23 +27,26 @@ class Regulator:
     Args:
         problem: Without the disturbance: Q and R.
         model: Its robot with the disturbance.
-        thrift: Factor on R. With more thrift the regulator asks for less, so that it stays within
-            the inputs' bounds for longer, and its cost-to-go is worth more as a terminal weight
-            (De Dona, Seron, Mayne & Goodwin, 2002, Systems & Control Letters 47(1)).
+        terminal_input_weight: Factor on R. With more of it the regulator asks for less, so that it
+            stays within the inputs' bounds for longer, and its cost-to-go is worth more as a
+            terminal weight (De Dona, Seron, Mayne & Goodwin, 2002, Systems & Control Letters
+            47(1)).
 
     Attributes:
         feedback: K (nu, nz).
 
     Raises:
-        BoundsError: `thrift` is not positive.
+        BoundsError: `terminal_input_weight` is not positive.
         InvalidArgumentError: No feedback stabilises the robot.
     """
 
-    def __init__(self, problem: Problem, model: Disturbed, thrift: float = 1.0) -> None:
+    def __init__(
+        self, problem: Problem, model: Disturbed, terminal_input_weight: float = 1.0
+    ) -> None:
         """Solve both equations."""
-        if as_number("thrift", thrift) <= 0:
-            raise BoundsError("thrift", f"{thrift} is not positive")
-        A, B, R = model.nominal.A, model.nominal.B, thrift * problem.R
+        if as_number("terminal_input_weight", terminal_input_weight) <= 0:
+            raise BoundsError("terminal_input_weight", f"{terminal_input_weight} is not positive")
+        A, B, R = model.nominal.A, model.nominal.B, terminal_input_weight * problem.R
         try:
             P = np.asarray(solve_discrete_are(A, B, problem.Q, R))
         except (np.linalg.LinAlgError, ValueError) as error:

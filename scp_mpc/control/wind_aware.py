@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.estimator import DisturbanceEstimator, Estimate
 from scp_mpc.control.mpc import MPC
+from scp_mpc.control.position_covariance import PositionCovariance, Prediction
 from scp_mpc.control.regulator import Regulator
-from scp_mpc.control.spread import Foresight, PositionSpread
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.models.disturbed import Disturbed
 from scp_mpc.models.linear import as_linear
@@ -40,15 +40,16 @@ class WindAwareMPC:
         problem: What to solve at each step, as without a disturbance.
         estimator: Of state and disturbance; it belongs to this controller.
         settings: How to solve it.
-        foresight: What is added to the doubt about the obstacles' positions: nothing, or how far
+        prediction: What is added to the doubt about the obstacles' positions: nothing, or how far
             the robot may be from its plan, with the plans to come ("closed loop") or without
-            ("open loop"); see `spread.py`.
-        thrift: If given, the last state is weighed by the cost-to-go of a regulator whose inputs
-            cost so many times R, wind included, instead of by `problem.Qf`; see `regulator.py`.
-            The feedback of a closed loop is then that regulator's.
+            ("open loop"); see `position_covariance.py`.
+        terminal_input_weight: If given, the last state is weighed by the cost-to-go of a regulator
+            whose inputs cost so many times R, wind included, instead of by `problem.Qf`; see
+            `regulator.py`. The feedback of a closed loop is then that regulator's.
 
     Raises:
-        InvalidArgumentError: The estimator's robot is not the problem's, or as in `PositionSpread`.
+        InvalidArgumentError: The estimator's robot is not the problem's; or as in
+            `PositionCovariance`.
     """
 
     def __init__(
@@ -57,18 +58,18 @@ class WindAwareMPC:
         estimator: DisturbanceEstimator,
         settings: Settings | None = None,
         *,
-        foresight: Foresight = "closed loop",
-        thrift: float | None = None,
+        prediction: Prediction = "closed loop",
+        terminal_input_weight: float | None = None,
     ) -> None:
         """Set up the solver for the robot with its disturbance."""
         if not isinstance(estimator, DisturbanceEstimator):
             raise InvalidArgumentError("estimator", f"{estimator!r} is not a DisturbanceEstimator")
         inner = disturbed(problem, estimator.model)
-        if thrift is not None:
-            weight = Regulator(problem, estimator.model, thrift).terminal_weight()
+        if terminal_input_weight is not None:
+            weight = Regulator(problem, estimator.model, terminal_input_weight).terminal_weight()
             inner = replace(inner, Qf=weight)
-        easy = 1.0 if thrift is None else thrift
-        self._spread = PositionSpread(problem, estimator, foresight, easy)
+        easy = 1.0 if terminal_input_weight is None else terminal_input_weight
+        self._spread = PositionCovariance(problem, estimator, prediction, easy)
         self._mpc = MPC(inner, settings)
         self._problem, self._estimator = problem, estimator
         self._applied: FloatArray | None = None

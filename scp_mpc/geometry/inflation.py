@@ -60,7 +60,7 @@ class Inflation(ABC):
             return self._linearise(sets, positions, s, start)
         positions = np.broadcast_to(positions, sets.means.shape)
         M, N, d = sets.means.shape
-        whole = replace(HalfSpaces.none(M, N, d), bend=np.zeros((M, N, d, d - 1)))
+        whole = replace(HalfSpaces.none(M, N, d), curvature=np.zeros((M, N, d, d - 1)))
         j = sets.shapes.others
         if len(j):
             _put(self._linearise(sets.taken(j), positions[j], s[j], start[j]), whole, j)
@@ -71,7 +71,7 @@ class Inflation(ABC):
             _put(linearise_walls(sets.taken(j), positions[j], s[j], side), whole, j)
         return whole
 
-    def bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+    def curvature_factor(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """Factor L (M, N, d+1, d-1) of g's second derivative in (p, s): Hessian = L L'.
 
         Args:
@@ -80,16 +80,16 @@ class Inflation(ABC):
             spaces: What `linearise` made of it there.
         """
         if sets.shapes is None:
-            return self._bend(sets, s, spaces)
-        assert spaces.bend is not None
+            return self._curvature_factor(sets, s, spaces)
+        assert spaces.curvature is not None
         M, N, d = sets.means.shape
         whole = np.zeros((M, N, d + 1, d - 1))  # s moves a wall's faces without turning them
-        whole[:, :, :d] = spaces.bend
+        whole[:, :, :d] = spaces.curvature
         j = sets.shapes.others
         j = j[sets.active[j]]
         if len(j):
             part = HalfSpaces(spaces.normal[j], spaces.slope[j], spaces.offset[j], spaces.value[j])
-            whole[j] = self._bend(sets.taken(j), s[j], part)
+            whole[j] = self._curvature_factor(sets.taken(j), s[j], part)
         return whole
 
     def clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
@@ -113,8 +113,8 @@ class Inflation(ABC):
         """`linearise` for ellipsoids."""
 
     @abstractmethod
-    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
-        """`bend` for ellipsoids."""
+    def _curvature_factor(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+        """`curvature_factor` for ellipsoids."""
 
     @abstractmethod
     def _clearance(self, sets: NoGoSets, positions: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ class ExactInflation(Inflation):
         offset = np.add.reduce(normal * sets.means, axis=-1) + sets.radii
         return _masked(sets, normal, slope, offset, sd - sets.radii)
 
-    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+    def _curvature_factor(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class.
 
         From y = grad h(n) + sd n with the support function h(n) = s |diag(sigma) n|: on the tangent
@@ -208,7 +208,7 @@ class AxesInflation(Inflation):
         offset = np.add.reduce(normal * positions, axis=-1) + slope * s[:, None] - value
         return _masked(sets, normal, slope, offset, value)
 
-    def _bend(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
+    def _curvature_factor(self, sets: NoGoSets, s: FloatArray, spaces: HalfSpaces) -> FloatArray:
         """See the base class; the change of w with s alone is left out: g is not convex in it."""
         e = np.maximum(s[:, None, None] * sets.deviations + sets.radii[..., None], _POINT)
         scale = self._scale(sets)[..., None]
@@ -247,8 +247,8 @@ def _put(part: HalfSpaces, whole: HalfSpaces, slots: IntArray) -> None:
     """Write the half-spaces of some slots into those of all."""
     for name in ("normal", "slope", "offset", "value"):
         getattr(whole, name)[slots] = getattr(part, name)
-    if part.bend is not None and whole.bend is not None:
-        whole.bend[slots] = part.bend
+    if part.curvature is not None and whole.curvature is not None:
+        whole.curvature[slots] = part.curvature
 
 
 def _masked(
@@ -278,7 +278,7 @@ def linearise_walls(
     sigma = largest(sets)
     value = near.distance - s[:, None] * sigma - sets.radii
     offset = np.add.reduce(near.normal * positions, axis=-1) - near.distance + sets.radii
-    return HalfSpaces(near.normal, -sigma, offset, value, near.bend)
+    return HalfSpaces(near.normal, -sigma, offset, value, near.curvature)
 
 
 def wall_clearance(sets: NoGoSets, positions: FloatArray, s: float) -> FloatArray:

@@ -144,15 +144,15 @@ class HalfSpaces:
         offset: (M, N) right-hand sides [m]; minus infinity in inactive slots.
         value: (M, N) true constraint function at the linearisation point [m], which is to be
             non-negative; plus infinity in inactive slots.
-        bend: (M, N, d, d-1) factor of the second derivative in p for the slots that are polytopes,
-            zero in others; None if there are none.
+        curvature: (M, N, d, d-1) factor of the second derivative in p for the slots that are
+            polytopes, zero in others; None if there are none.
     """
 
     normal: FloatArray
     slope: FloatArray
     offset: FloatArray
     value: FloatArray
-    bend: FloatArray | None = None
+    curvature: FloatArray | None = None
 
     @classmethod
     def none(cls, obstacles: int, stages: int, dim: int) -> "HalfSpaces":

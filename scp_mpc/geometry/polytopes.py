@@ -38,7 +38,7 @@ class Nearest(NamedTuple):
 
     distance: FloatArray
     normal: FloatArray
-    bend: FloatArray
+    curvature: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +147,10 @@ class Polytopes:
         L = np.zeros((*y.shape, y.shape[-1] - 1))
         j, i = np.nonzero(sd > 0)
         if len(j):
-            ridge, normal, bend = self._from_ridges(self.kind[j], y[j, i])
+            ridge, normal, curvature = self._from_ridges(self.kind[j], y[j, i])
             nearer = ridge > sd[j, i]
             j, i = j[nearer], i[nearer]
-            sd[j, i], n[j, i], L[j, i] = ridge[nearer], normal[nearer], bend[nearer]
+            sd[j, i], n[j, i], L[j, i] = ridge[nearer], normal[nearer], curvature[nearer]
         return Nearest(sd, n, L)
 
     def _towards(

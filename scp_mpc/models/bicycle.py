@@ -84,7 +84,7 @@ class KinematicBicycle(ComponentModel):
         slopes[..., 3, 5] = slopes[..., 4, 6] = 1.0
         return slopes
 
-    def bends(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., 7, 7), for weights m (..., 5)."""
         c, s, v, bend, rise = self._parts(states)
         ahead = weights[..., 0] * c + weights[..., 1] * s
@@ -98,7 +98,7 @@ class KinematicBicycle(ComponentModel):
         bent[..., 4, 4] = turning * v * (2.0 * self.wheelbase * bend * rise)
         return bent
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (2,) that stops it within one interval, the wheel held."""
         return np.array([-x[3] / self.dt, 0.0])
 

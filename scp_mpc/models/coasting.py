@@ -13,26 +13,27 @@ _ROUNDS = 5
 _CUT = 1e-9
 
 
-def coasting_brake(model: Model, x: FloatArray) -> FloatArray:
-    """Return the input (nu,) after which the idle model's next way is as short as can be.
+def coasting_stop(model: Model, x: FloatArray) -> FloatArray:
+    """Return the input (nu,) after which the coasting model's next way is as short as can be.
 
-    Minimises |d(f(x, u), idle)| over u by Gauss-Newton steps of least norm. A robot whose input
-    does not reach its speed within one interval needs a brake of its own.
+    Minimises |d(f(x, u), u_eq)| over u by Gauss-Newton steps of least norm, u_eq the equilibrium
+    input. A robot whose input does not reach its speed within one interval needs a function of
+    its own.
     """
-    u = model.idle.copy()
+    u = model.equilibrium_input.copy()
     for _ in range(_ROUNDS):
         first = model.linearise(x, u)
-        then = model.linearise(first.after, model.idle)
+        then = model.linearise(first.after, model.equilibrium_input)
         way = (then.after - first.after)[model.position]
         by_u = (then.A - np.eye(model.nx))[model.position] @ first.B
         if not (np.isfinite(way).all() and np.isfinite(by_u).all()):
-            return model.idle.copy()  # LAPACK would print
+            return model.equilibrium_input.copy()  # LAPACK would print
         u -= np.linalg.lstsq(by_u, way, rcond=_CUT)[0]
     return u
 
 
 def coasting_state(model: Model, position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return states (..., nx) there from which the idle model's way is dt times the velocity.
+    """Return states (..., nx) there from which the coasting model's way is dt times the velocity.
 
     Entries but the position, and the heading, which looks along the velocity, are the smallest
     that will do, by Gauss-Newton steps of least norm.
@@ -45,7 +46,7 @@ def coasting_state(model: Model, position: FloatArray, velocity: FloatArray) -> 
         fixed.add(model.heading)
     free = [i for i in range(model.nx) if i not in fixed]
     for _ in range(_ROUNDS):
-        there = model.linearise(x, model.idle)
+        there = model.linearise(x, model.equilibrium_input)
         missing = model.dt * velocity - (there.after - x)[..., model.position]
         by_x = (there.A - np.eye(model.nx))[..., model.position, :][..., free]
         x[..., free] += (np.linalg.pinv(by_x, rcond=_CUT) @ missing[..., None])[..., 0]

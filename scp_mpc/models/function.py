@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_count, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.models.coasting import coasting_brake, coasting_state
+from scp_mpc.models.coasting import coasting_state, coasting_stop
 from scp_mpc.models.model import Linearisation, Model, as_period, as_places, differences, joined
 from scp_mpc.models.runge_kutta import ContinuousModel
 
@@ -38,13 +38,14 @@ class FunctionModel(ContinuousModel):
         position: Indices of the position within the state, 2 or 3.
         discrete: g is the next state.
         heading: Index of the heading within the state, for a planar robot that has one.
-        idle: Input (nu,) to start plans from; zeros if None.
+        equilibrium_input: Input (nu,) to start plans from; zeros if None.
         vectorised: Both functions take (..., nx) and (..., nu); otherwise they are looped over.
         substeps: Runge-Kutta steps per interval.
-        brake: x (nx,) to the input (nu,) that stops it; if None, least squares over an interval.
+        stopping_input: x (nx,) to the input (nu,) that stops it; if None, least squares over an
+            interval.
         state: Positions and velocities (..., d) to states (..., nx); if None, least squares.
-        check: Compare the Jacobians with differences of g: True at zero and `idle`, or at given
-            points (states (..., nx), inputs (..., nu)). The shapes are always checked.
+        check: Compare the Jacobians with differences of g: True at zero and `equilibrium_input`, or
+            at given points (states (..., nx), inputs (..., nu)). The shapes are always checked.
 
     Raises:
         ShapeError: A function returns another shape than announced.
@@ -64,10 +65,10 @@ class FunctionModel(ContinuousModel):
         position: ArrayLike,
         discrete: bool = False,
         heading: int | None = None,
-        idle: ArrayLike | None = None,
+        equilibrium_input: ArrayLike | None = None,
         vectorised: bool = False,
         substeps: int = 1,
-        brake: Callable[[FloatArray], FloatArray] | None = None,
+        stopping_input: Callable[[FloatArray], FloatArray] | None = None,
         state: Function | None = None,
         check: bool | tuple[ArrayLike, ArrayLike] = False,
     ) -> None:
@@ -79,14 +80,24 @@ class FunctionModel(ContinuousModel):
             raise InvalidArgumentError("heading", f"{heading} is no index below {nx}")
         if not (callable(jacobians) or jacobians in ("central", "complex")):
             raise InvalidArgumentError("jacobians", f"{jacobians!r} is no function and no method")
-        for name, given in (("function", function), ("brake", brake), ("state", state)):
+        for name, given in (
+            ("function", function),
+            ("stopping_input", stopping_input),
+            ("state", state),
+        ):
             if not callable(given) and (given is not None or name == "function"):
                 raise InvalidArgumentError(name, f"{given!r} is not a function")
         self.heading, self.discrete = heading, bool(discrete)
-        self.idle = frozen(as_array("idle", np.zeros(nu) if idle is None else idle, (nu,)))
+        self.equilibrium_input = frozen(
+            as_array(
+                "equilibrium_input",
+                np.zeros(nu) if equilibrium_input is None else equilibrium_input,
+                (nu,),
+            )
+        )
         self._function, self._jacobians, self._vectorised = function, jacobians, vectorised
-        self._brake, self._state = brake, state
-        points = check if isinstance(check, tuple) else (np.zeros(self._nx), self.idle)
+        self._stop, self._state = stopping_input, state
+        points = check if isinstance(check, tuple) else (np.zeros(self._nx), self.equilibrium_input)
         x, u = as_array("check", points[0]), as_array("check", points[1])
         if x.shape[-1:] != (self._nx,) or u.shape[-1:] != (self._nu,):
             raise ShapeError("check", f"shapes {x.shape}, {u.shape} are not (..., nx), (..., nu)")
@@ -162,11 +173,11 @@ class FunctionModel(ContinuousModel):
             return Model.curvature(self, states, inputs, costates, fraction)
         return super().curvature(states, inputs, costates, fraction)
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,) by which the position comes to rest."""
-        if self._brake is None:
-            return coasting_brake(self, x)
-        return as_array("brake", self._brake(x), (self.nu,))
+        if self._stop is None:
+            return coasting_stop(self, x)
+        return as_array("stopping_input", self._stop(x), (self.nu,))
 
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return states (..., nx) at positions (..., d) with velocities (..., d)."""

@@ -133,7 +133,7 @@ class LinearModel(Model):
         states[..., others] = wanted @ np.linalg.pinv(drift[:, others]).T
         return states
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,), bounds aside, after which the position comes to rest.
 
         Without further input the next position but one would differ from the next by

@@ -69,7 +69,7 @@ class Model(ABC):
         return len(self.position)
 
     @cached_property
-    def idle(self) -> FloatArray:
+    def equilibrium_input(self) -> FloatArray:
         """Input (nu,) from which a plan starts where nothing better is known."""
         return frozen(np.zeros(self.nu))
 
@@ -122,7 +122,7 @@ class Model(ABC):
         return 0.5 * (bent + np.swapaxes(bent, -2, -1))
 
     @abstractmethod
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,), bounds aside, by which the position comes to rest.
 
         A model that cannot stop within one interval stops if it is asked again after each.

@@ -50,7 +50,7 @@ class PlanarQuadrotor(ComponentModel):
         object.__setattr__(self, "substeps", as_count("substeps", self.substeps))
 
     @cached_property
-    def idle(self) -> FloatArray:
+    def equilibrium_input(self) -> FloatArray:
         """Hover: thrust against gravity."""
         return frozen(np.array([self.gravity, 0.0]))
 
@@ -70,7 +70,7 @@ class PlanarQuadrotor(ComponentModel):
         slopes[..., 3, 6], slopes[..., 4, 6] = s, c
         return slopes
 
-    def bends(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., 8, 8), for weights m (..., 6)."""
         c, s = np.cos(states[..., 2]), np.sin(states[..., 2])
         m3, m4 = weights[..., 3], weights[..., 4]
@@ -79,7 +79,7 @@ class PlanarQuadrotor(ComponentModel):
         bent[..., 2, 6] = bent[..., 6, 2] = m3 * c - m4 * s
         return bent
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (2,) that, asked again after each interval, brings it to hover.
 
         Thrust that slows the speed down within twelve intervals, at half of gravity at most, and

@@ -55,7 +55,7 @@ class Quadrotor(ComponentModel):
         object.__setattr__(self, "substeps", as_count("substeps", self.substeps))
 
     @cached_property
-    def idle(self) -> FloatArray:
+    def equilibrium_input(self) -> FloatArray:
         """Hover: thrust against gravity."""
         return frozen(np.array([self.gravity, 0.0, 0.0, 0.0]))
 
@@ -120,7 +120,7 @@ class Quadrotor(ComponentModel):
             slopes[..., row, column] = entry
         return slopes
 
-    def bends(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., 13, 13), for weights m (..., 9)."""
         T, q2, q3 = inputs[..., 0], inputs[..., 2], inputs[..., 3]
         angles = [states[..., i] for i in (6, 7, 8)]
@@ -154,7 +154,7 @@ class Quadrotor(ComponentModel):
             bent[..., row, column] = bent[..., column, row] = entry
         return bent
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (4,) that, asked again after each interval, brings it to hover.
 
         Thrust that slows the speed down within ten intervals, at half of gravity at most, and

@@ -45,7 +45,7 @@ class ContinuousModel(NonlinearModel):
     def jacobians(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return dg/dz (..., nx, nx+nu) at states (..., nx) and inputs (..., nu)."""
 
-    def bends(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., n, n), for weights m (..., nx).
 
         Here from central differences of `jacobians`.
@@ -97,7 +97,7 @@ class ContinuousModel(NonlinearModel):
                 after, share = (m[first + i, ..., None, :] @ by_x)[..., 0, :], _NODES[i]
                 total = total + after
             y = total
-        bent = self.bends(points, inputs, m)
+        bent = self.hessian(points, inputs, m)
         return (np.swapaxes(W, -2, -1) @ (bent @ W)).sum(axis=0)
 
     def _spread(

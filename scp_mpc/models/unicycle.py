@@ -93,11 +93,11 @@ class Unicycle(NonlinearModel):
         arc = _Arc(states, inputs, self._time(fraction))
         dual = costates[..., 0] - 1j * costates[..., 1]
         bent = np.zeros((*np.broadcast_shapes(arc.way.shape, dual.shape), 6, 6))
-        for (row, column), entry in arc.bends().items():
+        for (row, column), entry in arc.hessian().items():
             bent[..., row, column] = bent[..., column, row] = (dual * entry).real
         return bent
 
-    def brake(self, x: FloatArray) -> FloatArray:
+    def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (2,) that stops it within one interval, straight on."""
         return np.array([-x[3] / self.dt, 0.0])
 
@@ -146,7 +146,7 @@ class _Arc:
         by_omega = self.half * by_theta + half * self.mixed(-j1, (j0 - 2.0 * j2) / 3.0)
         return by_theta, self.turned * j0, half * (j0 + 1j * j1), by_omega
 
-    def bends(self) -> dict[tuple[int, int], ComplexArray]:
+    def hessian(self) -> dict[tuple[int, int], ComplexArray]:
         """Second derivatives that are not zero, by pairs of indices within (x, u)."""
         _, by_v, by_a, by_omega = self.slopes()
         j0, j1, j2, j3 = self.j

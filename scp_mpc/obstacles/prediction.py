@@ -37,7 +37,7 @@ class ObstaclePrediction:
             deviation counts, in all directions; zero covariances make it a wall.
 
     Attributes:
-        spread: (N+1,) largest standard deviation in any direction [m].
+        largest_std: (N+1,) largest standard deviation in any direction [m].
 
     Raises:
         InvalidArgumentError: An argument is not numeric, or the name is not hashable.
@@ -53,7 +53,7 @@ class ObstaclePrediction:
     stamp: float | None
     name: Hashable
     shape: Solid | None
-    spread: FloatArray = field(init=False)
+    largest_std: FloatArray = field(init=False)
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class ObstaclePrediction:
         self._set(mu, Sigma, radius, stamp, name, shape, _deviations(variances))
 
     @classmethod
-    def still(
+    def static(
         cls,
         horizon: int,
         at: ArrayLike,
@@ -109,14 +109,14 @@ class ObstaclePrediction:
             np.tile(position, (rows, 1)), np.zeros((dim, dim)), radius, name=name, shape=shape
         )
 
-    def moved(
+    def with_rows(
         self, means: FloatArray, covariances: FloatArray, stamp: float | None
     ) -> "ObstaclePrediction":
         """Return the same obstacle elsewhere, unchecked: for what follows from checked arrays."""
-        moved = object.__new__(ObstaclePrediction)
-        spread = _deviations(np.linalg.eigvalsh(covariances))
-        moved._set(means, covariances, self.radius, stamp, self.name, self.shape, spread)
-        return moved
+        other = object.__new__(ObstaclePrediction)
+        largest_std = _deviations(np.linalg.eigvalsh(covariances))
+        other._set(means, covariances, self.radius, stamp, self.name, self.shape, largest_std)
+        return other
 
     def _set(
         self,
@@ -126,7 +126,7 @@ class ObstaclePrediction:
         stamp: float | None,
         name: Hashable,
         shape: Solid | None,
-        spread: FloatArray,
+        largest_std: FloatArray,
     ) -> None:
         object.__setattr__(self, "means", frozen(means))
         object.__setattr__(self, "covariances", frozen(covariances))
@@ -134,7 +134,7 @@ class ObstaclePrediction:
         object.__setattr__(self, "stamp", stamp)
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "shape", shape)
-        object.__setattr__(self, "spread", frozen(spread))
+        object.__setattr__(self, "largest_std", frozen(largest_std))
 
     @property
     def horizon(self) -> int:
@@ -184,9 +184,9 @@ def unchecked_predictions(
     """
     spreads = _deviations(np.linalg.eigvalsh(covariances))
     made = []
-    for mu, Sigma, spread, name in zip(means, covariances, spreads, names, strict=True):
+    for mu, Sigma, largest_std, name in zip(means, covariances, spreads, names, strict=True):
         made.append(object.__new__(ObstaclePrediction))
-        made[-1]._set(mu, Sigma, radius, stamp, name, None, spread)
+        made[-1]._set(mu, Sigma, radius, stamp, name, None, largest_std)
     return made
 
 

@@ -107,7 +107,7 @@ class Polytope(Solid):
         signs = np.stack(np.meshgrid(*[[-0.5, 0.5]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
         return cls(at + signs * lengths @ turn.T)
 
-    def still(
+    def static(
         self,
         horizon: int,
         at: ArrayLike | None = None,
@@ -123,7 +123,7 @@ class Polytope(Solid):
             name: Who it is.
         """
         at = np.zeros(self.dim) if at is None else at
-        return ObstaclePrediction.still(horizon, at, radius, name, self)
+        return ObstaclePrediction.static(horizon, at, radius, name, self)
 
 
 def _extent(rows: FloatArray, limits: FloatArray) -> float:

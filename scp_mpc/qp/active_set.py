@@ -8,7 +8,8 @@ The program is condensed: dynamics eliminated, in coordinates in which its Hessi
 
     minimise |v|^2 / 2   subject to   lower <= F v <= upper,   A v >= b
 
-Constraints with a cap yield where it takes more than that force to keep them: the exact L1 penalty.
+Constraints with an L1 weight are relaxed where it takes more than that force to keep them: the
+exact penalty.
 
 Notation:
     v       (nv,)       inputs and sizes
@@ -47,7 +48,7 @@ class CondensedQP:
         A: (K, nv) half-spaces.
         b: (K,) their right-hand sides.
         unbox: (nv, nv) inverse of F[:nv].
-        cap: (nf + K,) largest force on each constraint: finite where it may yield. None where
+        l1_weight: (nf + K,) largest force on each constraint: finite where it may yield. None where
             none may.
         least: Cost at v = 0.
     """
@@ -58,7 +59,7 @@ class CondensedQP:
     A: FloatArray
     b: FloatArray
     unbox: FloatArray
-    cap: FloatArray | None = None
+    l1_weight: FloatArray | None = None
     least: float = 0.0
 
     @cached_property
@@ -69,13 +70,13 @@ class CondensedQP:
     def merit(self, v: FloatArray) -> float:
         """Cost at v (nv,) and what it pays for constraints that yield."""
         merit = self.least + float(v @ v) / 2
-        if self.cap is None:
+        if self.l1_weight is None:
             return merit
         bounded = self.F @ v
         beyond = np.maximum(self.lower - bounded, bounded - self.upper)
         short = np.concatenate([beyond, self.b - self.A @ v])
-        soft = np.isfinite(self.cap)
-        return merit + float(self.cap[soft] @ np.maximum(short[soft], 0.0))
+        soft = np.isfinite(self.l1_weight)
+        return merit + float(self.l1_weight[soft] @ np.maximum(short[soft], 0.0))
 
     def dual_bound(self, force: FloatArray) -> float:
         """Lower bound of the optimum from any multipliers (nf + K,), stretched as they like best.
@@ -89,10 +90,10 @@ class CondensedQP:
         if gain <= 0:
             return self.least
         stretch = gain / pull2 if pull2 > _LEAST * gain else np.inf
-        if self.cap is not None:
-            soft = np.isfinite(self.cap) & (force != 0)
+        if self.l1_weight is not None:
+            soft = np.isfinite(self.l1_weight) & (force != 0)
             if soft.any():
-                stretch = min(stretch, float((self.cap[soft] / np.abs(force[soft])).min()))
+                stretch = min(stretch, float((self.l1_weight[soft] / np.abs(force[soft])).min()))
         if stretch == np.inf:
             return np.inf
         return self.least + stretch * gain - stretch * stretch * pull2 / 2
@@ -102,12 +103,12 @@ class CondensedQP:
 
         Their sum is a constraint by itself; it is held against the best that the box can do.
         """
-        if self.cap is not None and np.isfinite(self.cap[len(self.F) :]).any():
+        if self.l1_weight is not None and np.isfinite(self.l1_weight[len(self.F) :]).any():
             return False
         force, n = self._admissible(force), len(self.unbox)
         force[:n] = 0.0
-        if self.cap is not None:
-            force[np.isfinite(self.cap)] = 0.0
+        if self.l1_weight is not None:
+            force[np.isfinite(self.l1_weight)] = 0.0
         asked = self._asked(force)
         if asked <= 0:
             return False
@@ -157,7 +158,7 @@ class QPSolution:
         v: (nv,) point.
         force: (nf + K,) positive at lower bounds and half-spaces.
         active: (nf + K,) -1 at a lower bound or half-space, 1 at an upper bound, 0 elsewhere.
-        capped: (nf + K,) constraints that yield at the largest force.
+        relaxed: (nf + K,) constraints that yield at the largest force.
         rows: (k, nv) responses of the active constraints that hold with equality.
         indices: (k,) which they are.
         factor: (k, k) upper Cholesky factor of rows rows'.
@@ -166,24 +167,24 @@ class QPSolution:
     v: FloatArray
     force: FloatArray
     active: IntArray
-    capped: BoolArray
+    relaxed: BoolArray
     rows: FloatArray
     indices: IntArray
     factor: FloatArray
 
 
-def solve_on(qp: CondensedQP, active: IntArray, capped: BoolArray) -> QPSolution:
+def solve_on(qp: CondensedQP, active: IntArray, relaxed: BoolArray) -> QPSolution:
     """Solve for exactly this active set; of rows that depend on others the surplus is left out."""
     nf = len(qp.F)
     v, force = np.zeros(qp.F.shape[1]), np.zeros(len(active))
     indices = active.nonzero()[0]
-    if qp.cap is not None and capped.any():
-        force[capped] = -active[capped] * qp.cap[capped]
+    if qp.l1_weight is not None and relaxed.any():
+        force[relaxed] = -active[relaxed] * qp.l1_weight[relaxed]
         v = force[:nf] @ qp.F + force[nf:] @ qp.A
-        indices = (active * ~capped).nonzero()[0]
+        indices = (active * ~relaxed).nonzero()[0]
     if not len(indices):
         none = np.zeros((0, len(v)))
-        return QPSolution(v, force, active, capped, none, indices, np.zeros((0, 0)))
+        return QPSolution(v, force, active, relaxed, none, indices, np.zeros((0, 0)))
     split = int(np.searchsorted(indices, nf))
     bounds, spaces = indices[:split], indices[split:] - nf
     rows = qp.rows[indices]
@@ -198,7 +199,7 @@ def solve_on(qp: CondensedQP, active: IntArray, capped: BoolArray) -> QPSolution
     else:
         v_rows = strength @ rows
     force[indices] = strength
-    return QPSolution(v + v_rows, force, active, capped, rows, indices, factor)
+    return QPSolution(v + v_rows, force, active, relaxed, rows, indices, factor)
 
 
 def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -> bool:
@@ -206,7 +207,7 @@ def holds(qp: CondensedQP, solution: QPSolution, tolerance: float = _ACCURACY) -
     if (solution.force * solution.active).max(initial=0.0) > 0.0:
         return False
     depth = qp.violations(solution.v)[0]
-    return bool(np.where(solution.capped, 0.0, depth).max(initial=0.0) <= tolerance)
+    return bool(np.where(solution.relaxed, 0.0, depth).max(initial=0.0) <= tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,18 +227,18 @@ class Settled:
     late: bool = False
 
 
-def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) -> Settled:
+def settled(qp: CondensedQP, active: IntArray, relaxed: BoolArray, changes: int) -> Settled:
     """Go from a guess of the active set to the program's solution: a dual active-set method.
 
     First, who pulls leaves: one wrong constraint spoils the forces of its neighbours, so that only
     the worst leave at a time. Then forces are admissible, and who is violated the most joins; those
     whose force it takes away leave on the way (Goldfarb and Idnani, 1983). A force that reaches its
-    cap stays there, and its constraint yields.
+    l1_weight stays there, and its constraint yields.
 
     Args:
         qp: The program.
         active: (nf + K,) guess, as in `QPSolution`.
-        capped: (nf + K,) guess of those that yield.
+        relaxed: (nf + K,) guess of those that yield.
         changes: Systems to solve at most, beyond the first.
     """
     none = (
@@ -245,37 +246,37 @@ def settled(qp: CondensedQP, active: IntArray, capped: BoolArray, changes: int) 
         np.append(qp.upper >= _NONE, np.ones(len(qp.b), dtype=np.bool_)),
     )
     active = np.where(((active < 0) & none[0]) | ((active > 0) & none[1]), 0, active)
-    solution, systems = solve_on(qp, active, capped & (active != 0)), 1
-    capped = solution.capped
+    solution, systems = solve_on(qp, active, relaxed & (active != 0)), 1
+    relaxed = solution.relaxed
     while np.isfinite(solution.v @ solution.v):
         force, active = solution.force, solution.active
-        pull = np.where(capped, 0.0, force * active)
+        pull = np.where(relaxed, 0.0, force * active)
         worst = pull.max(initial=0.0)
         if worst > _PULL * np.abs(force).max(initial=1.0):
             active = np.where(pull >= _SHARE * worst, 0, active)
-        elif qp.cap is not None and (np.abs(force) > qp.cap * (1 + _PULL)).any():
-            capped = capped | (np.abs(force) > qp.cap * (1 + _PULL))
+        elif qp.l1_weight is not None and (np.abs(force) > qp.l1_weight * (1 + _PULL)).any():
+            relaxed = relaxed | (np.abs(force) > qp.l1_weight * (1 + _PULL))
         else:
             return _joined(qp, solution, systems, changes + 1)
         if systems > changes:
             break
-        solution, systems = solve_on(qp, active, capped), systems + 1
+        solution, systems = solve_on(qp, active, relaxed), systems + 1
     return Settled(None, systems)
 
 
 def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> Settled:
     """Let violated constraints join, from a solution whose forces are admissible."""
-    active, capped = solution.active.copy(), solution.capped.copy()
+    active, relaxed = solution.active.copy(), solution.relaxed.copy()
     force, v = np.abs(solution.force), solution.v.copy()
-    cap = np.full(len(force), np.inf) if qp.cap is None else qp.cap
+    l1_weight = np.full(len(force), np.inf) if qp.l1_weight is None else qp.l1_weight
     while True:
         depth, side = qp.violations(v)
-        depth = np.where(capped, -depth, np.where(active != 0, 0.0, depth))
+        depth = np.where(relaxed, -depth, np.where(active != 0, 0.0, depth))
         p = int(depth.argmax())
         if depth[p] <= _ACCURACY:
             if systems > 1:  # rounding of all the steps goes, and the factor comes
-                solution = solve_on(qp, active, capped)
-            wrong = np.where(solution.capped, 0.0, solution.force * solution.active)
+                solution = solve_on(qp, active, relaxed)
+            wrong = np.where(solution.relaxed, 0.0, solution.force * solution.active)
             if wrong.max(initial=0.0) > 0:  # no more than rounding, or the vertex is degenerate
                 solution = replace(solution, force=np.where(wrong > 0, 0.0, solution.force))
                 if wrong.max() > _PULL * np.abs(solution.force).max(initial=1.0):
@@ -283,17 +284,17 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
             if systems > 1 and not holds(qp, solution, _HELD):
                 return Settled(None, systems)
             return Settled(solution, systems)
-        yields = capped[p]  # and its force is to fall, for there is room
+        yields = relaxed[p]  # and its force is to fall, for there is room
         if not yields:
             active[p] = side[p]
-        capped[p] = False
+        relaxed[p] = False
         others = active != 0
         others[p] = False
         while True:
             if systems >= most:
                 return Settled(None, systems)
             systems += 1
-            W = (others & ~capped).nonzero()[0]
+            W = (others & ~relaxed).nonzero()[0]
             N = -active[W, None] * qp.rows[W]
             n = -active[p] * qp.rows[p] * (-1.0 if yields else 1.0)
             r = np.zeros(0)
@@ -307,8 +308,8 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
             whole = gap / reach if reach > _DEPENDENT * float(n @ n) else np.inf
             with np.errstate(divide="ignore", invalid="ignore"):
                 leave = np.where(r > 0, force[W] / r, np.inf)
-                stop = np.where(r < 0, (cap[W] - force[W]) / -r, np.inf)
-            own = force[p] if yields else cap[p] - force[p]
+                stop = np.where(r < 0, (l1_weight[W] - force[W]) / -r, np.inf)
+            own = force[p] if yields else l1_weight[p] - force[p]
             length = min(whole, leave.min(initial=np.inf), stop.min(initial=np.inf), own)
             if not length < np.inf:  # or NaN
                 return Settled(None, systems, infeasible=length == np.inf)
@@ -319,7 +320,7 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
                 others[p] = True
                 break
             if length == own:
-                capped[p], force[p] = not yields, 0.0 if yields else cap[p]
+                relaxed[p], force[p] = not yields, 0.0 if yields else l1_weight[p]
                 if yields:
                     active[p] = 0
                 break
@@ -328,7 +329,7 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
                 active[j], force[j], others[j] = 0, 0.0, False
             else:
                 j = W[int(stop.argmin())]
-                capped[j], force[j] = True, cap[j]
+                relaxed[j], force[j] = True, l1_weight[j]
 
 
 def _gap(qp: CondensedQP, v: FloatArray, p: int, side: int, yields: bool) -> float:

@@ -56,11 +56,11 @@ class Rows:
         active = np.zeros(len(self.place), dtype=np.intp)
         there = self.place >= 0
         active[there] = np.sign(y[self.place[there]])
-        capped = np.zeros(len(active), dtype=np.bool_)
+        relaxed = np.zeros(len(active), dtype=np.bool_)
         if self.below is not None and self.above is not None:
             pin = np.where(active < 0, self.below, self.above)
-            capped = (active != 0) & (pin >= 0) & (y[pin] == 0)
-        return active, capped
+            relaxed = (active != 0) & (pin >= 0) & (y[pin] == 0)
+        return active, relaxed
 
     def forces(self, y: FloatArray) -> FloatArray:
         """Multipliers y (m,) as forces (nf + K,), positive at lower bounds."""

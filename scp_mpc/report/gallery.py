@@ -106,7 +106,7 @@ def space_view(axes: Any, run: Drive) -> Show:
         last = min(k, len(run.plans) - 1)
         for told in run.predictions[last]:
             (x, y), size = told.means[-1, :2], run.problem.size_for(run.problem.max_obstacles, 1)
-            wide = told.radius + size * told.spread[-1]
+            wide = told.radius + size * told.largest_std[-1]
             ring = x + wide * np.cos(angle), y + wide * np.sin(angle), 0 * angle
             drawn.append(axes.plot(*ring, color=OBSTACLE, alpha=0.35, linewidth=1.0)[0])
         way = run.positions[: k + 1]

@@ -43,7 +43,7 @@ _WAYS = ((False, (0.0, -1.0, 1.0)), (True, (-2.0,)))
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class CandidatePath:
     """Where and when to pass which obstacle.
 
     Attributes:
@@ -60,7 +60,7 @@ class Side:
 
 
 @dataclass(frozen=True, eq=False)
-class Passing:
+class Homotopy:
     """How a plan passes the obstacles.
 
     Attributes:
@@ -78,7 +78,7 @@ def candidates(
     present: FloatArray,
     s: FloatArray,
     most: int = MAX_CANDIDATES,
-) -> list[Side]:
+) -> list[CandidatePath]:
     """Return the ways past the obstacles in conflict, the first conflict first; none without any.
 
     Args:
@@ -95,7 +95,7 @@ def candidates(
     ways = (
         side
         for j in order
-        for side in _ways(
+        for side in _paths_past(
             step, free, _elsewhere(step, free, present, conflict, j), s, j, conflict[j]
         )
     )
@@ -107,7 +107,7 @@ def candidates(
 
 def _together(
     step: Step, free: FloatArray, s: FloatArray, conflict: BoolArray, walls: IntArray
-) -> Iterator[Side]:
+) -> Iterator[CandidatePath]:
     """Stay in front of the polytopes in conflict; or pass them, each on either side."""
     hit = conflict[walls]
     if not hit.any():
@@ -119,18 +119,18 @@ def _together(
     v, normals = _directions(free - step.means[j, 1:], points, step.nodes.count)
     waiting = free.copy()
     waiting[points[0] :] = free[points[0] - 1] if points[0] else step.here
-    yield Side(j, -v / np.linalg.norm(v), 0.0, waiting)
+    yield CandidatePath(j, -v / np.linalg.norm(v), 0.0, waiting)
     body = Walls.of(step, s, walls, slice(0, len(free)))
     for n in normals if len(walls) > 1 else ():
-        yield Side(j, n, 0.0, body.aside(free[None], n[None])[0])
+        yield CandidatePath(j, n, 0.0, body.aside(free[None], n[None])[0])
     for mixed in product(*[normals[:2]] * min(len(walls), _MIXED)):
         if len(walls) > 1 and any(n is not mixed[0] for n in mixed):
             # Those beyond the first few go with the last of them.
             sides = np.array([*mixed, *[mixed[-1]] * (len(walls) - len(mixed))])
-            yield Side(j, mixed[0], 0.0, body.apart(free, sides))
+            yield CandidatePath(j, mixed[0], 0.0, body.apart(free, sides))
 
 
-def varied(step: Step, way: Passing, s: FloatArray) -> list[FloatArray]:
+def varied(step: Step, way: Homotopy, s: FloatArray) -> list[FloatArray]:
     """Paths that pass one polytope at one stage by another face than a way does."""
     assert step.shapes is not None
     walls = step.shapes.slots
@@ -152,7 +152,7 @@ def _elsewhere(
     return path
 
 
-def same_way(step: Step, first: Passing, second: Passing) -> bool:
+def same_homotopy(step: Step, first: Homotopy, second: Homotopy) -> bool:
     """Whether two plans are pushed by the same obstacles at the same stages on the same side."""
     K = step.nodes.count
     mine, theirs = (step.nodes.stages(p.touched).any(axis=2) for p in (first, second))
@@ -175,14 +175,14 @@ def _outward(step: Step, path: FloatArray, j: IntArray, i: IntArray) -> FloatArr
     return y
 
 
-def _ways(
+def _paths_past(
     step: Step,
     free: FloatArray,
     elsewhere: FloatArray,
     s: FloatArray,
     j: int,
     conflict: BoolArray,
-) -> Iterator[Side]:
+) -> Iterator[CandidatePath]:
     K, around = step.nodes.count, _AROUND * step.nodes.count
     points = _first_run(conflict, around)
     v, normals = _directions(free - step.means[j, 1:], points, K)
@@ -193,14 +193,14 @@ def _ways(
         for n in body.faces(normals):
             path = elsewhere.copy()
             path[reach] = body.aside(free[None, reach], n[None])[0]
-            yield Side(j, n, 0.0, path)
+            yield CandidatePath(j, n, 0.0, path)
     for outward, times in _WAYS:
         shifts, sides = np.repeat(times, len(normals)), np.tile(np.array(normals), (len(times), 1))
         moved = free[reach] + shifts[:, None, None] * v
         paths = np.repeat(elsewhere[None], len(sides), axis=0)
         paths[:, reach] = (body.outward if outward else body.aside)(moved, sides)
         for time, n, path in zip(shifts.tolist(), sides, paths, strict=True):
-            yield Side(j, n, time, path)
+            yield CandidatePath(j, n, time, path)
 
 
 def _first_run(conflict: BoolArray, around: int) -> IntArray:

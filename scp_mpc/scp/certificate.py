@@ -79,8 +79,8 @@ class Certificate:
     def __init__(self, problem: Problem, layout: Layout) -> None:
         """Remember the problem."""
         self._problem, self._layout = problem, layout
-        idle = problem.model.idle
-        self._idle = idle if idle.any() else None
+        rest = problem.model.equilibrium_input
+        self._rest = rest if rest.any() else None
 
     def costates(
         self,
@@ -151,7 +151,7 @@ class Certificate:
         problem, c = self._problem, self._layout
         u, e, w = rollout.inputs, rollout.deviations, problem.size.weight
         away = y[c.s] - problem.size.reference
-        push = u if self._idle is None else u - self._idle
+        push = u if self._rest is None else u - self._rest
         track, effort = self.track(e), push @ problem.R
         cost = float(np.vdot(track, e) + np.vdot(effort, push) + w * (away @ away))
         scale = max(1.0, 2 * float(np.abs(track).max()), 2 * float(np.abs(effort).max()))
@@ -172,16 +172,16 @@ class Certificate:
         if c.size > c.u.stop or reaction.any():
             (lower, upper), boxed = bounds, y[c.boxed]
             below, above = boxed - lower[c.boxed], upper[c.boxed] - boxed
-            give = np.zeros(len(boxed))
+            allowed = np.zeros(len(boxed))
             if c.size > c.u.stop:  # only changes and states can be beyond their bounds
                 beyond = np.maximum(0.0, -np.minimum(below, above))
-                excess = beyond[c.yielding]
-                yields = np.abs(reaction[c.yielding]) >= problem.state_slack_weight
-                give[c.yielding] = np.where(yields, excess, 0.0)
-                feasibility = max(feasibility, float((beyond - give).max()))
+                excess = beyond[c.relaxable]
+                yields = np.abs(reaction[c.relaxable]) >= problem.state_slack_weight
+                allowed[c.relaxable] = np.where(yields, excess, 0.0)
+                feasibility = max(feasibility, float((beyond - allowed).max()))
             pushing = reaction != 0
             if pushing.any():
-                room = np.abs(reaction * (np.where(reaction > 0, below, above) + give))
+                room = np.abs(reaction * (np.where(reaction > 0, below, above) + allowed))
                 product = max(product, float(room[pushing].max()))
         residuals = KKTResiduals(stationarity / scale, feasibility, product / max(1.0, cost))
         return Nominal(

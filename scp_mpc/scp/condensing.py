@@ -274,7 +274,7 @@ class Condenser:
         problem, layout = self._problem, self._layout
         e, u = rollout.deviations, rollout.inputs
         by = self._sensitivity if self.linear else self._sensitivity_along(rollout.along)
-        push = u - problem.model.idle
+        push = u - problem.model.equilibrium_input
         effort, away = push @ problem.R, s - problem.size.reference
         gradient = 2 * effort.ravel() + e.ravel() @ by.weighed
         here = by.inverse @ gradient

@@ -57,11 +57,11 @@ class Fallback:
     def brake(self, step: Step, status: Status = Status.BRAKING) -> Result:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
         problem, model, x = self._problem, self._problem.model, step.x0
-        rest = np.clip(model.idle, problem.u_min, problem.u_max)
+        rest = np.clip(model.equilibrium_input, problem.u_min, problem.u_max)
         most, least = problem.u_max - rest, problem.u_min - rest
         U, last = np.tile(rest, (problem.horizon, 1)), step.u_last
         for u in U:
-            wanted = model.brake(x) - rest
+            wanted = model.stopping_input(x) - rest
             if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
                 break
             # As far as the bounds allow in the direction of what is wanted; inputs without any

@@ -67,7 +67,7 @@ class Iterate:
         s: Sizes.
         slack: Violations.
         multipliers: Those of all constraints, or None.
-        free: The plan that ignores the obstacles, where another one was found.
+        obstacle_free: The plan that ignores the obstacles, where another one was found.
         alternatives: Multipliers (N, nu) of the input bounds and (M, C) of the obstacles, of the
             programs of other ways past them, by obstacle and number; see `multi_start.py`.
     """
@@ -77,7 +77,7 @@ class Iterate:
     s: FloatArray
     slack: FloatArray
     multipliers: Multipliers | None = None
-    free: "Iterate | None" = None
+    obstacle_free: "Iterate | None" = None
     alternatives: Mapping[tuple[int, int], tuple[FloatArray, FloatArray]] = field(
         default_factory=dict
     )
@@ -116,7 +116,7 @@ class Iterate:
             self.s,
             _shifted(self.slack, 1, N),
             None if self.multipliers is None else self.multipliers.shifted(),
-            None if self.free is None else self.free.shifted(model),
+            None if self.obstacle_free is None else self.obstacle_free.shifted(model),
             alternatives,
         )
 

@@ -30,7 +30,7 @@ class Layout:
         variables: nv, inputs and moving sizes.
         shape: (N, nu) of the inputs.
         inputs: Of the boxed entries, the slice of the inputs.
-        yielding: Of the boxed entries, the slice of those that yield where they must: z.
+        relaxable: Of the boxed entries, the slice of those that yield where they must: z.
     """
 
     def __init__(self, problem: Problem, nodes: Nodes) -> None:
@@ -49,7 +49,7 @@ class Layout:
         self.variables = N * nu + self.moving
         self.boxed = slice(self.s.start if self.moving else self.u.start, self.size)
         self.bounded = self.size - self.boxed.start
-        self.yielding = slice(self.z.start - self.boxed.start, self.size - self.boxed.start)
+        self.relaxable = slice(self.z.start - self.boxed.start, self.size - self.boxed.start)
         self.inputs = slice(self.u.start - self.boxed.start, self.u.stop - self.boxed.start)
         self._lower = self._bounds(-_NONE, problem.size.lower, problem.u_min, problem.du_min)
         self._upper = self._bounds(_NONE, problem.size.upper, problem.u_max, problem.du_max)
@@ -124,8 +124,8 @@ class Layout:
         N, nu = self.shape
         s = np.zeros(self.s.stop - self.s.start)
         s[: self.moving] = forces[: self.moving]
-        du = forces[self.inputs.stop : self.yielding.start]
-        z = forces[self.yielding]
+        du = forces[self.inputs.stop : self.relaxable.start]
+        z = forces[self.relaxable]
         empty = np.zeros((0, 0))
         return (
             s,
@@ -139,9 +139,9 @@ class Layout:
         forces = np.zeros(self.bounded)
         forces[: self.moving], forces[self.inputs] = s[: self.moving], u.ravel()
         if du.size:
-            forces[self.inputs.stop : self.yielding.start] = du.ravel()
+            forces[self.inputs.stop : self.relaxable.start] = du.ravel()
         if z.size:
-            forces[self.yielding] = z.ravel()
+            forces[self.relaxable] = z.ravel()
         return forces
 
     def pushed(self, reaction: FloatArray) -> tuple[FloatArray | None, FloatArray]:
@@ -149,13 +149,13 @@ class Layout:
         N, nu = self.shape
         on_u = reaction[self.inputs].reshape(N, nu)
         if self._rates:
-            pull = reaction[self.inputs.stop : self.yielding.start].reshape(N, nu)
+            pull = reaction[self.inputs.stop : self.relaxable.start].reshape(N, nu)
             on_u = on_u + pull
             on_u[:-1] -= pull[1:]
         if not len(self._states):
             return None, on_u
         on_e = np.zeros((N, self._problem.model.nx))
-        on_e[:, self._states] = reaction[self.yielding].reshape(N, -1)
+        on_e[:, self._states] = reaction[self.relaxable].reshape(N, -1)
         return on_e, on_u
 
     def _bounds(self, none: float, size: float, u: FloatArray, du: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.scp.candidates import Passing, same_way
+from scp_mpc.scp.candidates import Homotopy, same_homotopy
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record, recorded
 from scp_mpc.scp.iterate import NEGLIGIBLE
@@ -50,7 +50,7 @@ class Loop:
         goal: Result | None = None,
         about: FloatArray | None = None,
         limit: int | None = None,
-        firm: bool = False,
+        hard: bool = False,
     ) -> Result | None:
         """Descend from a plan; None if no plan was accepted, or if given up.
 
@@ -59,26 +59,26 @@ class Loop:
             goal: Give up when it is plain that this plan will not be reached.
             about: (ny,) where the first half-spaces are taken, which need not obey the dynamics.
             limit: Iterations at most; None for as many as the settings allow.
-            firm: Whether to give up where the obstacles would have to yield.
+            hard: Whether to give up where the obstacles would have to yield.
         """
         at, clock, history = self._at, self._at.clock, list[Record]()
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
-        region, give, iterations = Region(at), Relaxation.NOBODY, 0  # give: who may yield
+        region, level, iterations = Region(at), Relaxation.NOBODY, 0
         reached: Nominal | None = None  # the last plan that was accepted
         while iterations < (limit or self._settings.max_iterations) and clock.allows("iteration"):
             with clock.task("iteration"):
                 condensed = at.linearise(nominal)
-                program = at.write(nominal, condensed, planes, give, region.radius)
+                program = at.write(nominal, condensed, planes, level, region.radius)
                 end = at.solve(program, nominal)
                 convex = end.solution
                 if convex is not None:
                     solution = refined(at, program, convex)
                     trial = at.certify(program, solution)
             if convex is None:
-                more = at.next_relaxation(give, firm or not len(nominal.force))
+                more = at.next_relaxation(level, hard or not len(nominal.force))
                 if more is None or end.late:
                     break
-                give = more  # no solution, or none found: the next ones may yield
+                level = more  # no solution, or none found: the next ones may yield
                 continue
             iterations += 1
             wider = at.screen(trial)
@@ -99,7 +99,7 @@ class Loop:
                 continue
             before = inf if reached is None else reached.residuals.worst
             nominal, reached, planes = trial, trial, trial.planes
-            give = give if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
+            level = level if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
             if self._is_converged(trial, before):
                 reached, direction = at.second_order(trial, program, solution)
                 away = downhill(at, reached, direction)
@@ -109,12 +109,12 @@ class Loop:
                 continue
             if goal is not None and self._is_vain(iterations, trial, goal):
                 return None
-        return None if reached is None else self.result(reached, give, iterations, tuple(history))
+        return None if reached is None else self.result(reached, level, iterations, tuple(history))
 
     def result(
         self,
         nominal: Nominal,
-        give: Relaxation = Relaxation.NOBODY,
+        level: Relaxation = Relaxation.NOBODY,
         iterations: int = 0,
         history: tuple[Record, ...] = (),
     ) -> Result:
@@ -125,9 +125,9 @@ class Loop:
         if not status.certified and residuals.feasibility > tolerance:  # then all of it counts
             nominal = replace(nominal, slack=np.maximum(-nominal.planes.g, 0.0))
         merit = at.merit(nominal.cost, float(nominal.slack.sum()), nominal.excess)
-        cap = at.problem.slack_weight if give is Relaxation.EVERYBODY else inf
+        l1_weight = at.problem.slack_weight if level is Relaxation.EVERYBODY else inf
         given = nominal.cost, merit, residuals, status, iterations, nominal, history
-        return Result(at.iterate(nominal, cap), *given)
+        return Result(at.iterate(nominal, l1_weight), *given)
 
     def _is_converged(self, trial: Nominal, before: float) -> bool:
         """Whether a plan is certified, and another iteration would hardly better it."""
@@ -143,6 +143,6 @@ class Loop:
             return True
         if not len(trial.force) or abs(cost - goal.cost) > _ALIKE * goal.cost:
             return False
-        mine = Passing(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
+        mine = Homotopy(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
         path = at.nodes.positions(there.states, there.inputs)
-        return same_way(at.step, mine, Passing(path, there.touched[: at.step.count]))
+        return same_homotopy(at.step, mine, Homotopy(path, there.touched[: at.step.count]))

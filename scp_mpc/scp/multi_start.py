@@ -18,9 +18,9 @@ from scp_mpc.qp.active_set import CondensedQP
 from scp_mpc.scp.candidates import (
     MAX_CANDIDATES,
     MOST_AMONG_WALLS,
-    Passing,
+    Homotopy,
     candidates,
-    same_way,
+    same_homotopy,
     varied,
 )
 from scp_mpc.scp.certificate import Nominal
@@ -31,7 +31,7 @@ from scp_mpc.scp.pairs import Pairs, Planes
 from scp_mpc.scp.plan import Candidate, Result
 from scp_mpc.scp.transcription import Relaxation, Transcription
 
-# A rival must be better by this share, or the plan flickers between ways of equal cost.
+# A challenger must be better by this share, or the plan flickers between ways of equal cost.
 _HYSTERESIS = 0.001
 _HOPELESS = 3.0  # times the plan's own merit: more than that one program does not make good
 _BEAM = 3  # ways among polytopes that are varied
@@ -112,7 +112,7 @@ class MultiStart:
         if not most:
             return Found(best)
         began = clock.elapsed()
-        here = Passing(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
+        here = Homotopy(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
         ways, numbers = candidates(step, free, here.path, full, most), Counter[int]()
         if not ways:
@@ -143,17 +143,17 @@ class MultiStart:
         for one in ranked[:follow] if safe else ranked:
             if one.v is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
-            if safe and same_way(step, about.passing(one), here):
+            if safe and same_homotopy(step, about.passing(one), here):
                 continue  # this way leads to where we are
-            rival = self._loop.run(about.start(one), goal, one.planes.y, firm=True)
-            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
-                goal, switched = rival, True
+            challenger = self._loop.run(about.start(one), goal, one.planes.y, hard=True)
+            if challenger is not None and challenger.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = challenger, True
         # None is without slack; then the one that seems to need the least is worth a try.
         first = ranked[0] if ranked and not goal.status.ok else None
         if first is not None and first.v is not None and first.merit < goal.merit:
-            rival = self._loop.run(about.start(first), goal, first.planes.y)
-            if rival is not None and rival.beats(goal, _HYSTERESIS * goal.merit):
-                goal, switched = rival, True
+            challenger = self._loop.run(about.start(first), goal, first.planes.y)
+            if challenger is not None and challenger.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = challenger, True
         kept = replace(goal.iterate, alternatives=duals)
         return Found(replace(goal, iterate=kept), tried, switched)
 
@@ -184,12 +184,12 @@ class MultiStart:
         ys = np.repeat(about.plan.y[None], len(paths), axis=0)
         ys[:, c.s] = at.problem.size.reference
         ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
-        give = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
+        relaxation = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
         limit = _HOPELESS * best.merit if best.status.ok else inf
         only_best = best.status.ok and not thorough and self._settings.max_candidates == 1
         programs = []
         for planes, duals in zip(about.plan.pairs.about(ys), known, strict=True):
-            qp = at.condensed_qp(about.condensed, about.plan.pairs, planes, give)
+            qp = at.condensed_qp(about.condensed, about.plan.pairs, planes, relaxation)
             force = None if duals is None else about.force(duals)
             programs.append((-inf if force is None else qp.dual_bound(force), qp, planes, force))
         looks: list[Ranked | None] = [None] * len(paths)
@@ -198,10 +198,10 @@ class MultiStart:
             if not at.clock.allows("candidate"):
                 break
             if force is not None and bound > limit:
-                at.firm.solver.finished["cut"] += 1
+                at.hard.solver.finished["cut"] += 1
                 looks[k] = Ranked(inf, planes, force)
                 continue
-            looks[k] = one = self._look(about, planes, give, qp, limit, thorough)
+            looks[k] = one = self._look(about, planes, relaxation, qp, limit, thorough)
             if only_best:
                 limit = min(limit, one.merit)
         return looks
@@ -210,7 +210,7 @@ class MultiStart:
         self,
         about: "Present",
         planes: Planes,
-        give: Relaxation,
+        relaxation: Relaxation,
         qp: CondensedQP,
         limit: float,
         thorough: bool,
@@ -220,7 +220,7 @@ class MultiStart:
         A thorough look solves it; else the multipliers after a few iterations have to do.
         """
         at, condensed = self._at, about.condensed
-        program = at.write(about.plan, condensed, planes, give, qp=qp)
+        program = at.write(about.plan, condensed, planes, relaxation, qp=qp)
         solver, start = program.subproblem.solver, at.start(program, about.plan)
         merit, (z, y) = solver.rank(qp, program.rows, start, limit)
         force, exact = program.rows.forces(y), None
@@ -277,10 +277,10 @@ class Present:
     plan: Nominal
     condensed: Condensed
 
-    def passing(self, one: Ranked) -> Passing:
+    def passing(self, one: Ranked) -> Homotopy:
         """How the point that a program reached passes the obstacles."""
         force = self.plan.pairs.table(one.force[self.at.layout.bounded :])
-        return Passing(self.at.path(self._reached(one))[1:], force > NEGLIGIBLE)
+        return Homotopy(self.at.path(self._reached(one))[1:], force > NEGLIGIBLE)
 
     def start(self, one: Ranked) -> Nominal:
         """The plan to which that point leads, with its multipliers."""

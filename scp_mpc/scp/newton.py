@@ -42,7 +42,7 @@ def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolu
     """Go on from a convex step to Newton's, if its active set carries that far."""
     condensed, nf = program.condensed, len(program.qp.F)
     if at.linear:
-        bends, push, L = at.bends(program, solution.force[nf:])
+        bends, push, L = at.curvature_factors(program, solution.force[nf:])
         if not len(push):
             return solution
         moved = condensed.y(solution.v) - program.planes.y

@@ -98,10 +98,10 @@ class Pairs:
         g = spaces.value.reshape(count, K)
         return [Planes(y, values, rows, spaces) for y, values, rows in zip(ys, g, a, strict=True)]
 
-    def bend(self, planes: Planes) -> FloatArray:
+    def curvature_factor(self, planes: Planes) -> FloatArray:
         """Factor L (K, w, d-1) of the second derivatives at the planes' point."""
         s = planes.y[self.at[:, -1]]
-        return self._step.problem.no_go.bend(self._sets, s, planes.spaces)[:, 0]
+        return self._step.problem.no_go.curvature_factor(self._sets, s, planes.spaces)[:, 0]
 
     def table(self, values: FloatArray) -> FloatArray:
         """Values (K,) of the pairs as (J, C); zero elsewhere."""

@@ -52,7 +52,7 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A rival plan that was tried beside the one from the nominal plan.
+    """Another plan that was tried beside the one from the nominal plan.
 
     Attributes:
         obstacle: Index of the obstacle that it was to pass on another side.

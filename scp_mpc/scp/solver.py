@@ -177,8 +177,8 @@ class SCP:
                 at.step = self._widened(step, self._motion(nominal))
             about, path = at.at(nominal), at.outputs(nominal)
             about = at.at(nominal, about=path)
-            give = Relaxation.EVERYBODY if elastic else Relaxation.NOBODY
-            program = at.write(about, at.linearise(about), about.pairs.planes(path), give)
+            relaxation = Relaxation.EVERYBODY if elastic else Relaxation.NOBODY
+            program = at.write(about, at.linearise(about), about.pairs.planes(path), relaxation)
             return program.subproblem.program.copy()
         finally:
             self._busy.release()
@@ -225,10 +225,10 @@ class SCP:
         if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
             at.step = wide
             return self._plan(wide, Found(self._loop.result(free)), clock)
-        at.free = at.iterate(free)
+        at.obstacle_free = at.iterate(free)
         # Where the inputs lead from a state that a disturbance has moved says little about sides.
         about = None if last is None else at.outputs(last)
-        start = at.free if last is None else last
+        start = at.obstacle_free if last is None else last
         for _ in range(_CORRECTIONS):
             assumed = None
             if free_motion is not None:
@@ -246,7 +246,7 @@ class SCP:
             ending = clock.elapsed()
             best = self._rescued(wide, last, found.best)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
-                best = replace(best, iterate=replace(best.iterate, free=at.free))
+                best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))
             found = replace(found, best=best)
             if assumed is None or self._is_kept(step, assumed, found.best):
                 break
@@ -266,18 +266,20 @@ class SCP:
         sought, and one program about it has to do.
         """
         at, limit = self._at, None
-        known = last if last is None or last.free is None else last.free
-        plan = at.unobstructed(known) if at.linear else None
+        known = last if last is None or last.obstacle_free is None else last.obstacle_free
+        plan = at.obstacle_free_optimum(known) if at.linear else None
         if plan is None:
             if last is None:
-                start = at.plain(np.tile(self.problem.model.idle, (self.problem.horizon, 1)))
+                start = at.plain(
+                    np.tile(self.problem.model.equilibrium_input, (self.problem.horizon, 1))
+                )
             elif at.linear:
                 start = at.at(known or last, at.nobody.near)
             else:
                 start = at.at(last, at.nobody.near)
                 limit = 1 if last.touches else None
-                if last.free is not None and not last.touches:
-                    other = at.at(last.free, at.nobody.near)
+                if last.obstacle_free is not None and not last.touches:
+                    other = at.at(last.obstacle_free, at.nobody.near)
                     merits = [at.merit(p.cost, 0.0, p.excess) for p in (start, other)]
                     start = other if merits[1] < merits[0] else start
             found = None
@@ -339,7 +341,7 @@ class SCP:
         slack = iterate.slack[: step.count]
         if step.nodes.count > 1:
             slack = frozen(step.nodes.stages(slack).max(axis=2, initial=0.0))
-        finished = self._at.firm.solver.finished + self._at.elastic.solver.finished
+        finished = self._at.hard.solver.finished + self._at.elastic.solver.finished
         return Plan(
             X=iterate.states,
             U=iterate.inputs,

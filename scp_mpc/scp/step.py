@@ -122,7 +122,7 @@ class Step:
     @cached_property
     def spreads(self) -> FloatArray:
         """(J, C+1) bounds of the standard deviations in any direction [m]."""
-        spreads = np.array([o.spread for o in self.obstacles])
+        spreads = np.array([o.largest_std for o in self.obstacles])
         if self.robot_covariance is None and self.nodes.count == 1 and self.scale is None:
             return spreads
         variances = spreads * spreads
@@ -141,7 +141,7 @@ class Step:
         """
         nodes, now = self.nodes, self.means[:, :1]
         means = np.concatenate([now, self.means[:, nodes.discs :: nodes.discs]], axis=1)
-        variances = np.array([o.spread for o in self.obstacles]) ** 2
+        variances = np.array([o.largest_std for o in self.obstacles]) ** 2
         growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0))
         growth = np.repeat(growth / nodes.instants, nodes.instants, axis=1)
         length: FloatArray = np.sqrt(_squared(means[:, 1:] - means[:, :-1]))

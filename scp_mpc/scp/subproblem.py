@@ -11,7 +11,7 @@ Only this file knows the order of its variables and rows:
 
 There is a fixed number of slots for half-spaces at each node, for the nearest obstacles; empty ones
 hold zeros. Near pairs beyond that are in the condensed program only, against which `active_set.py`
-checks whatever OSQP says, and join there where they must. A firm program has no slack; an elastic
+checks whatever OSQP says, and join there where they must. A hard program has no slack; an elastic
 one has below and above for bounded states and slack for half-spaces, each at its price per unit:
 the exact L1 penalty. OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w), to which
 curvature may be added stage by stage.
@@ -78,7 +78,7 @@ class Subproblem:
         self._coupling = self._couplings()
         A, self._places = self._constraints(shape)
         q, lower, upper = np.zeros(shape[1]), np.full(shape[0], -np.inf), np.full(shape[0], np.inf)
-        q[self._u] = -2 * np.tile(problem.R @ model.idle, N)
+        q[self._u] = -2 * np.tile(problem.R @ model.equilibrium_input, N)
         q[self._s] = -2 * problem.size.weight * problem.size.reference
         q[self._below] = q[self._above] = problem.state_slack_weight * self._coupling[0]
         q[self._slack] = problem.slack_weight * self._coupling[1]
@@ -117,7 +117,7 @@ class Subproblem:
         below, above = program.lower[self._bounded], program.upper[self._bounded]
         below[:] = np.where(lower <= -_NONE, -np.inf, lower)
         above[:] = np.where(upper >= _NONE, np.inf, upper)
-        if u_last is not None and self._layout.yielding.start > rates:
+        if u_last is not None and self._layout.relaxable.start > rates:
             below[rates : rates + len(u_last)] += u_last
             above[rates : rates + len(u_last)] += u_last
 
@@ -126,7 +126,7 @@ class Subproblem:
         pairs: Pairs,
         planes: Planes,
         along: Derivatives,
-        yielding: bool = True,
+        relaxable: bool = True,
     ) -> Rows:
         """Write the half-spaces of the nearest pairs; return which row is whose.
 
@@ -134,7 +134,7 @@ class Subproblem:
             pairs: All pairs that are near.
             planes: Their half-spaces.
             along: How positions depend on states and inputs, about the plan of the dynamics.
-            yielding: In an elastic program, whether the obstacles may yield, too.
+            relaxable: In an elastic program, whether the obstacles may yield, too.
         """
         layout, nodes, S, program = self._layout, self._nodes, self._slots, self.program
         d, N, data = self._problem.model.dim, layout.shape[0], self.program.A.data
@@ -171,11 +171,11 @@ class Subproblem:
         below, above = np.full((2, nf + K), -1, dtype=np.intp)
         states = self._below.stop - self._below.start
         if states:
-            below[layout.yielding] = self._pins.start + np.arange(states)
-            above[layout.yielding] = self._pins.start + states + np.arange(states)
-        if yielding:
+            below[layout.relaxable] = self._pins.start + np.arange(states)
+            above[layout.relaxable] = self._pins.start + states + np.arange(states)
+        if relaxable:
             below[nf + kept] = self._pins.start + 2 * states + slot
-        data[self._places["slack"]] = self._coupling[1] * yielding
+        data[self._places["slack"]] = self._coupling[1] * relaxable
         return Rows(place, below, above)
 
     def start(
@@ -200,7 +200,7 @@ class Subproblem:
             price, states = self._problem.slack_weight, self._below.stop - self._below.start
             pins = np.zeros(self._pins.stop - self._pins.start)
             if states:
-                toll, pull = self._problem.state_slack_weight, force[self._layout.yielding]
+                toll, pull = self._problem.state_slack_weight, force[self._layout.relaxable]
                 pins[:states] = -np.maximum(toll - pull, 0.0) * self._coupling[0]
                 pins[states : 2 * states] = -np.maximum(toll + pull, 0.0) * self._coupling[0]
             spaces = y[self._spaces]
@@ -281,11 +281,11 @@ class Subproblem:
         sizes, inputs = np.arange(layout.moving), np.arange(N * model.nu)
         blocks.add("s", bounded + sizes, self._s.start + sizes, 1.0)
         blocks.add("u", bounded + layout.inputs.start + inputs, self._u.start + inputs, 1.0)
-        rates = np.arange(layout.inputs.stop, layout.yielding.start)
+        rates = np.arange(layout.inputs.stop, layout.relaxable.start)
         blocks.add("du", bounded + rates, self._u.start + np.arange(len(rates)), 1.0)
         later = rates[model.nu :]
         blocks.add("du before", bounded + later, self._u.start + np.arange(len(later)), -1.0)
-        states = bounded + np.arange(layout.yielding.start, layout.yielding.stop)
+        states = bounded + np.arange(layout.relaxable.start, layout.relaxable.stop)
         blocks.add("z", states, state[:, 0, problem.bounded_states].ravel(), 1.0)
         inner = nodes.count - nodes.discs
         space = self._spaces.start + np.arange(nodes.size * S).reshape(N, nodes.count, S, 1)

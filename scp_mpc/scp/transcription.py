@@ -46,7 +46,7 @@ class Program:
         condensed: The problem that it was condensed from.
         pairs: Whose half-spaces it holds.
         planes: These.
-        give: Who may give way.
+        relaxation: Who may give way.
         qp: Its values, condensed.
         subproblem: Holds its values as a sparse program, and the solver.
         rows: Which row of that is which constraint.
@@ -55,7 +55,7 @@ class Program:
     condensed: Condensed
     pairs: Pairs
     planes: Planes
-    give: Relaxation
+    relaxation: Relaxation
     qp: CondensedQP
     subproblem: Subproblem
     rows: Rows
@@ -75,12 +75,12 @@ class Transcription:
         linear: Whether the robot is linear.
         step: The control step, with radii and sizes as they count just now.
         nobody: No pairs at all.
-        free: The plan that ignores the obstacles, where another one was found.
+        obstacle_free: The plan that ignores the obstacles, where another one was found.
     """
 
     step: Step
     nobody: Pairs
-    free: Iterate | None
+    obstacle_free: Iterate | None
 
     def __init__(self, problem: Problem, settings: Settings, nodes: Nodes) -> None:
         """Condense the problem, lay the programs out and set up their solvers."""
@@ -88,7 +88,7 @@ class Transcription:
         self.layout = Layout(problem, nodes)
         self.condenser = Condenser(problem, nodes, self.layout)
         self.linear = self.condenser.linear
-        self.firm, self.elastic = (
+        self.hard, self.elastic = (
             Subproblem(problem, nodes, self.layout, settings, elastic) for elastic in (False, True)
         )
         self._certificate = Certificate(problem, self.layout)
@@ -99,11 +99,11 @@ class Transcription:
 
     def begin(self, step: Step, clock: Clock) -> None:
         """Read a control step."""
-        self.step, self.clock, self.free = step, clock, None
+        self.step, self.clock, self.obstacle_free = step, clock, None
         self.condenser.begin(step)
         self.bounds = self.layout.bounds(step)
         self.nobody = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
-        for subproblem in (self.firm, self.elastic):
+        for subproblem in (self.hard, self.elastic):
             subproblem.solver.finished, subproblem.about = Counter(), None
 
     # --- plans
@@ -131,11 +131,11 @@ class Transcription:
         reaction: FloatArray,
         pairs: Pairs,
         force: FloatArray,
-        capped: BoolArray | None = None,
+        relaxed: BoolArray | None = None,
     ) -> Nominal:
-        """A plan with its residuals; see `Certificate.certify`. Nobody yields unless `capped`."""
+        """A plan with its residuals; see `Certificate.certify`. Nobody yields unless `relaxed`."""
         planes = pairs.planes(y)
-        slack = np.zeros(len(force)) if capped is None else np.maximum(-planes.g, 0.0) * capped
+        slack = np.zeros(len(force)) if relaxed is None else np.maximum(-planes.g, 0.0) * relaxed
         given = y, rollout, reaction, pairs, planes, force, slack
         return self._certificate.certify(*given, self.bounds)
 
@@ -170,17 +170,17 @@ class Transcription:
             force = -duals.obstacles[pairs.obstacle, pairs.node]
         return self.nominal(y, rollout, reaction, pairs, force)
 
-    def unobstructed(self, guess: Iterate | None) -> Nominal | None:
+    def obstacle_free_optimum(self, guess: Iterate | None) -> Nominal | None:
         """A linear robot's plan that ignores the obstacles, from the bounds where another one is.
 
         No more than a few linear systems: the program has only bounds, and few of them change from
         step to step. None where that does not lead to it.
         """
-        rest = np.tile(self.problem.model.idle, (self.problem.horizon, 1))
+        rest = np.tile(self.problem.model.equilibrium_input, (self.problem.horizon, 1))
         condensed = self.condenser.condensed(self.condenser.rolled(rest), self._full)
         free, (lower, upper), box = condensed.y_free, self.bounds, self.layout.boxed
         if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
-            self.firm.solver.finished["kkt"] += 1
+            self.hard.solver.finished["kkt"] += 1
             return self.plain(free[self.layout.u].reshape(rest.shape))
         planes = self.nobody.planes(free)
         qp = self.condensed_qp(condensed, self.nobody, planes)
@@ -193,8 +193,8 @@ class Transcription:
         self.clock.charge("solve")
         if end.solution is None:
             return None
-        self.firm.solver.finished["kkt"] += 1
-        given = condensed, self.nobody, planes, Relaxation.NOBODY, qp, self.firm
+        self.hard.solver.finished["kkt"] += 1
+        given = condensed, self.nobody, planes, Relaxation.NOBODY, qp, self.hard
         return self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
 
     def outputs(self, iterate: Iterate) -> FloatArray:
@@ -250,7 +250,7 @@ class Transcription:
         nominal: Nominal,
         condensed: Condensed,
         planes: Planes,
-        give: Relaxation = Relaxation.NOBODY,
+        relaxation: Relaxation = Relaxation.NOBODY,
         radius: FloatArray | None = None,
         qp: CondensedQP | None = None,
     ) -> Program:
@@ -260,29 +260,29 @@ class Transcription:
             nominal: The plan, whose pairs the program holds.
             condensed: The problem condensed about it.
             planes: Half-spaces of its pairs.
-            give: Who may give way.
+            relaxation: Who may give way.
             radius: (N nu,) by how much inputs may change at most, or None.
             qp: Its condensed values, if they are known.
         """
         pairs, along = nominal.pairs, condensed.about.along
         if qp is None:
-            qp = self.condensed_qp(condensed, pairs, planes, give, radius)
-        subproblem = self.firm if give is Relaxation.NOBODY else self.elastic
+            qp = self.condensed_qp(condensed, pairs, planes, relaxation, radius)
+        subproblem = self.hard if relaxation is Relaxation.NOBODY else self.elastic
         if subproblem.about is None or not (self.linear or subproblem.about is condensed.about):
             subproblem.write_dynamics(condensed.about)
         free = condensed.y_free[self.layout.boxed]
         subproblem.write_bounds(qp.lower + free, qp.upper + free, self.step.u_last)
-        everybody = give is Relaxation.EVERYBODY
+        everybody = relaxation is Relaxation.EVERYBODY
         rows = subproblem.write_half_spaces(pairs, planes, along, everybody)
         self.clock.charge("update")
-        return Program(condensed, pairs, planes, give, qp, subproblem, rows)
+        return Program(condensed, pairs, planes, relaxation, qp, subproblem, rows)
 
     def condensed_qp(
         self,
         condensed: Condensed,
         pairs: Pairs,
         planes: Planes,
-        give: Relaxation = Relaxation.NOBODY,
+        relaxation: Relaxation = Relaxation.NOBODY,
         radius: FloatArray | None = None,
     ) -> CondensedQP:
         """The condensed values of a convex program; arguments as for `write`."""
@@ -294,15 +294,15 @@ class Transcription:
             lower, upper, u = lower.copy(), upper.copy(), condensed.about.inputs.ravel()
             lower[c.inputs] = np.maximum(lower[c.inputs], u - radius)
             upper[c.inputs] = np.minimum(upper[c.inputs], u + radius)
-        cap = None
-        if give is not Relaxation.NOBODY:
-            cap = np.full(len(lower) + len(b), np.inf)
-            cap[c.yielding] = self.problem.state_slack_weight
-            if give is Relaxation.EVERYBODY:
-                cap[len(lower) :] = self.problem.slack_weight
+        l1_weight = None
+        if relaxation is not Relaxation.NOBODY:
+            l1_weight = np.full(len(lower) + len(b), np.inf)
+            l1_weight[c.relaxable] = self.problem.state_slack_weight
+            if relaxation is Relaxation.EVERYBODY:
+                l1_weight[len(lower) :] = self.problem.slack_weight
         free = condensed.y_free[c.boxed]
         return CondensedQP(
-            by.bounded, lower - free, upper - free, A, b, by.unbox, cap, condensed.least
+            by.bounded, lower - free, upper - free, A, b, by.unbox, l1_weight, condensed.least
         )
 
     def start(self, program: Program, nominal: Nominal) -> tuple[FloatArray, FloatArray]:
@@ -318,10 +318,10 @@ class Transcription:
         self.clock.charge("solve")
         return end
 
-    def next_relaxation(self, give: Relaxation, firm: bool) -> Relaxation | None:
-        """Who is to give way next; None if nobody is left: firm obstacles never do."""
-        more = [level for level in self._levels if level > give]
-        if not more or (firm and more[0] is Relaxation.EVERYBODY):
+    def next_relaxation(self, relaxation: Relaxation, hard: bool) -> Relaxation | None:
+        """Who is to give way next; None if nobody is left: hard obstacles never do."""
+        more = [level for level in self._levels if level > relaxation]
+        if not more or (hard and more[0] is Relaxation.EVERYBODY):
             return None
         return more[0]
 
@@ -335,14 +335,16 @@ class Transcription:
             boxed[near] = bound[c.boxed][near]
         guess = None if self.linear else condensed.deviations(solution.v)
         y, rollout = self.rolled(y[c.u].reshape(c.shape), y[c.s], guess)
-        force, capped = solution.force[nf:], solution.capped[nf:]
-        plan = self.nominal(y, rollout, solution.force[:nf], program.pairs, force, capped)
+        force, relaxed = solution.force[nf:], solution.relaxed[nf:]
+        plan = self.nominal(y, rollout, solution.force[:nf], program.pairs, force, relaxed)
         self.clock.charge("linearise")
         return plan
 
     # --- curvature
 
-    def bends(self, program: Program, force: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
+    def curvature_factors(
+        self, program: Program, force: FloatArray
+    ) -> tuple[FloatArray, IntArray, FloatArray]:
         """How the half-spaces that push bend, each times the root of its force.
 
         Returns:
@@ -353,14 +355,14 @@ class Transcription:
             none, d = np.zeros((0, program.qp.F.shape[1])), self.problem.model.dim
             return none, np.zeros(0, dtype=np.intp), np.zeros((0, d + 1, d - 1))
         push = (force > NEGLIGIBLE).nonzero()[0]
-        L = pairs.bend(planes)[push] * np.sqrt(force[push])[:, None, None]
+        L = pairs.curvature_factor(planes)[push] * np.sqrt(force[push])[:, None, None]
         rows = pairs.rows(program.condensed.by.S)[push]
         bends = np.einsum("kwm,kwn->kmn", L, rows)
         return bends.reshape(-1, bends.shape[-1]), push, L
 
     def curvature(self, program: Program, solution: QPSolution) -> FloatArray:
         """W (nv, nv): what the convex program leaves out of the Lagrangian's second derivative."""
-        bends = self.bends(program, solution.force[len(program.qp.F) :])[0]
+        bends = self.curvature_factors(program, solution.force[len(program.qp.F) :])[0]
         W = self._dynamics_curvature(program, solution)
         return -bends.T @ bends if W is None else W - bends.T @ bends
 
@@ -393,7 +395,7 @@ class Transcription:
         """
         qp, by, nf = program.qp, program.condensed.by, len(program.qp.F)
         W = self._dynamics_curvature(program, solution)
-        bends = self.bends(program, solution.force[nf:])[0]
+        bends = self.curvature_factors(program, solution.force[nf:])[0]
         if W is None and not len(bends):  # nothing but the convex program
             residuals = replace(plan.residuals, curvature=1.0)
             return replace(plan, residuals=residuals), np.zeros(self.layout.shape)
@@ -415,8 +417,8 @@ class Transcription:
         reaction: FloatArray = -self.layout.gathered(*given)
         return reaction
 
-    def iterate(self, nominal: Nominal, cap: float = np.inf) -> Iterate:
-        """Name the parts of a plan in the words of the problem; `cap` is the largest force."""
+    def iterate(self, nominal: Nominal, l1_weight: float = np.inf) -> Iterate:
+        """Name the parts of a plan in the words of the problem; no force beyond `l1_weight`."""
         problem, c, pairs = self.problem, self.layout, nominal.pairs
         states = self.step.x_ref.copy()
         states[0] = self.step.x0
@@ -430,10 +432,10 @@ class Transcription:
                 pull = nominal.force * nominal.planes.a[:, -1]
                 pulled = np.bincount(pairs.obstacle, weights=pull, minlength=len(margin))
                 margin = pulled.astype(np.float64)
-        pins = forces - cap if np.isfinite(cap) else forces
+        pins = forces - l1_weight if np.isfinite(l1_weight) else forces
         duals = Multipliers(nominal.costates, inputs, margin, -forces, pins, limits, rates)
         s = nominal.y[c.s].copy()
-        return Iterate(states, nominal.rollout.inputs, s, slack, duals, self.free).frozen()
+        return Iterate(states, nominal.rollout.inputs, s, slack, duals, self.obstacle_free).frozen()
 
     def _condensed_curvature(
         self, condensed: Condensed, stages: FloatArray, sway: FloatArray | None

@@ -103,10 +103,10 @@ class Doorway:
         people = np.stack(
             [way.positions(v * times) for way, (v, _) in zip(ways, _ROUTES, strict=True)]
         )
-        bodies = [wall.still(self.steps) for wall in self.walls]
+        bodies = [wall.static(self.steps) for wall in self.walls]
         bodies += [ObstaclePrediction(way, np.zeros((2, 2)), _PERSON) for way in people]
         fixed = [
-            wall.still(self.horizon, radius=_ROOM_TO_SPARE, name=f"wall {j}")
+            wall.static(self.horizon, radius=_ROOM_TO_SPARE, name=f"wall {j}")
             for j, wall in enumerate(self.walls)
         ]
         tracker = Tracker(
@@ -114,7 +114,7 @@ class Doorway:
             self.horizon,
             radius=_PERSON,
             measurement_std=self.noise,
-            settings=TrackerSettings(confirm=1),
+            settings=TrackerSettings(confirmations=1),
         )
         limits = SpeedLimits(self.speed, lateral=0.6, longitudinal=0.6)
         follow = PathReference(self.path, speed=limits, model=problem.model, horizon=self.horizon)

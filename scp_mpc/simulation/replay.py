@@ -18,13 +18,15 @@ from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.scp.plan import Status
-from scp_mpc.settings import Freshness, Settings, require_positive
+from scp_mpc.settings import Settings, StalenessPolicy, require_positive
 from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
 from scp_mpc.tracking.tracker import Tracker, TrackerSettings
 
 DT = 0.2  # [s]
-TRACKING = TrackerSettings(confirm=1)  # with names nothing is a false alarm: tell of it at once
+TRACKING = TrackerSettings(
+    confirmations=1
+)  # with names nothing is a false alarm: tell of it at once
 REACHED = 0.3  # [m] from the goal
 _TICK = 1e-6  # [s]
 
@@ -170,7 +172,9 @@ def replay(
     if seed < 0:
         raise BoundsError("seed", f"{seed} is negative")
     K, dt = control_steps(recording, steps, model.dt), model.dt
-    mpc = MPC(problem, Settings(freshness=Freshness(keep=0)) if settings is None else settings)
+    mpc = MPC(
+        problem, Settings(staleness=StalenessPolicy(keep=0)) if settings is None else settings
+    )
     tracker = Tracker(
         dt,
         problem.horizon,

@@ -4,7 +4,7 @@ Notation:
     n, M                number of tracks and of motions
     w   (n, M)          probability of each motion
     m   (n, M, nx)      mean given the motion       P   (n, M, nx, nx)  covariance given the motion
-    pi  (M,)            shares of the motions       tau                 sojourn [s]
+    pi  (M,)            shares of the motions       tau                 dwell_time [s]
     Pi  (M, M)          Pi_ij: probability of going on with motion j after motion i
 
 Motions change like a Markov chain in continuous time: with rate 1/tau a motion is drawn anew,
@@ -67,13 +67,13 @@ class MotionBank:
 
     Args:
         motions: At least one.
-        sojourn: tau [s].
+        dwell_time: tau [s].
         dim: Dimension d of the workspace.
     """
 
-    def __init__(self, motions: Sequence[Motion], sojourn: float, dim: int) -> None:
+    def __init__(self, motions: Sequence[Motion], dwell_time: float, dim: int) -> None:
         """Normalise the shares."""
-        self.motions, self.sojourn, self.dim = tuple(motions), sojourn, dim
+        self.motions, self.dwell_time, self.dim = tuple(motions), dwell_time, dim
         weights = np.array([motion.weight for motion in motions], dtype=np.float64)
         self.shares: FloatArray = weights / weights.sum()
         self._last: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
@@ -82,7 +82,7 @@ class MotionBank:
         """Return F (M, nx, nx), Q (M, nx, nx) and Pi (M, M) over `dt` seconds."""
         if self._last is None or self._last[0] != dt:
             F, Q = zip(*(motion.transition(dt, self.dim) for motion in self.motions), strict=True)
-            stay = np.exp(-dt / self.sojourn)
+            stay = np.exp(-dt / self.dwell_time)
             Pi = stay * np.eye(len(F)) + (1 - stay) * self.shares
             self._last = dt, (np.array(F), np.array(Q), Pi)
         return self._last[1]

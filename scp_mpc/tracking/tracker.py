@@ -50,38 +50,39 @@ class TrackerSettings:
     """How a tracker works.
 
     The default motions are for people who walk: straight on most of the time, and now and then
-    restless. Densities, weights and sojourn have the largest likelihood of what a recorded street
-    scene (148 people, 5.8 at a time) did 0.4 to 4.8 s ahead, seen each 0.4 s with errors of 5 cm.
-    Fitted to its first half, they lose 0.02 nats per sample on the second against those fitted to
-    all of it. Against one constant velocity they gain 0.09; turns, `WALKING_AND_TURNING`, gain
+    restless. Densities, weights and dwell time have the largest likelihood of what a recorded
+    street scene (148 people, 5.8 at a time) did 0.4 to 4.8 s ahead, seen each 0.4 s with errors of
+    5 cm. Fitted to its first half, they lose 0.02 nats per sample on the second against those
+    fitted to all of it. Against one constant velocity they gain 0.09; turns, `WALKING_AND_TURNING`, gain
     another 0.01 and are left out.
 
     People have heavier tails than any Gaussian: over that scene, ellipses for 50, 90 and 95 % hold
-    54 to 67, 88 to 91 and 93 %, so that what is beyond 95 % is 7 % rather than 5. `spread` widens
-    them: at 1.2 those for 95 % hold 96 to 97 %, and those for 50 % hold 66 to 76.
+    54 to 67, 88 to 91 and 93 %, so that what is beyond 95 % is 7 % rather than 5.
+    `std_inflation` widens them: at 1.2 those for 95 % hold 96 to 97 %, and those for
+    50 % hold 66 to 76.
 
     Attributes:
         motions: The ways in which an obstacle may move; at least one. For turns at a rate that is
             not known, several rates: their probabilities are estimated.
-        sojourn: Mean time [s] after which the motion is drawn anew, by the motions' weights.
+        dwell_time: Mean time [s] after which the motion is drawn anew, by the motions' weights.
         speed: Standard deviation [m/s] of each component of the velocity of which nothing is
             known yet.
-        confirm: Measurements after which a track is told of; the first one says nothing about the
-            velocity, so that predictions from it alone are as wide as `speed` makes them.
+        confirmations: Measurements after which a track is told of; the first one says nothing about
+            the velocity, so that predictions from it alone are as wide as `speed` makes them.
         keep: Seconds without a measurement after which a track ends.
         gate: Probability that the right measurement is near enough to its track to be taken for
             it; where measurements have no names.
-        spread: Factor on the standard deviations of all predictions: for obstacles that are less
-            predictable than the motions say, or for more of the tails.
+        std_inflation: Factor on the standard deviations of all predictions: for obstacles that are
+            less predictable than the motions say, or for more of the tails.
     """
 
     motions: tuple[Motion, ...] = WALKING
-    sojourn: float = 1.3
+    dwell_time: float = 1.3
     speed: float = 1.0
-    confirm: int = 2
+    confirmations: int = 2
     keep: float = 1.0
     gate: float = 0.999
-    spread: float = 1.0
+    std_inflation: float = 1.0
 
     def __post_init__(self) -> None:
         """Check every setting."""
@@ -90,9 +91,9 @@ class TrackerSettings:
         for k, motion in enumerate(self.motions):
             if not isinstance(motion, Motion):
                 raise InvalidArgumentError(f"motions[{k}]", f"{motion!r} is not a Motion")
-        for name in ("sojourn", "speed", "spread"):
+        for name in ("dwell_time", "speed", "std_inflation"):
             require_positive(name, getattr(self, name))
-        as_count("confirm", self.confirm)
+        as_count("confirmations", self.confirmations)
         if as_number("keep", self.keep) < 0:
             raise BoundsError("keep", f"{self.keep} s is negative")
         if not 0 < as_number("gate", self.gate) < 1:
@@ -136,7 +137,7 @@ class Tracker:
     `association`), and what is left begins new ones, which are called 0, 1, 2, ...
 
     A track that is not measured goes on by itself for `settings.keep` seconds. So the controller
-    need not keep vanished obstacles as well: `Settings(freshness=Freshness(keep=0))`.
+    need not keep vanished obstacles as well: `Settings(staleness=StalenessPolicy(keep=0))`.
 
     Args:
         dt: Interval of the predictions [s], the robot's.
@@ -173,8 +174,8 @@ class Tracker:
         self._noise = float(measurement_std) ** 2 * np.eye(dim)
         self._radius, self._dim = float(radius), dim
         self._gate = self.settings.gate_at(dim)
-        self._bank = MotionBank(self.settings.motions, self.settings.sojourn, dim)
-        self._foresight = HorizonPredictor(self._bank, as_count("horizon", horizon), float(dt))
+        self._bank = MotionBank(self.settings.motions, self.settings.dwell_time, dim)
+        self._prediction = HorizonPredictor(self._bank, as_count("horizon", horizon), float(dt))
         self.reset()
 
     def reset(self) -> None:
@@ -262,9 +263,9 @@ class Tracker:
         if now < self._time - _TICK:
             raise StaleDataError("time", f"{now} s is before the last update's {self._time} s")
         tracks = self._moved(max(now, self._time))
-        tracks = tracks.at(np.flatnonzero(tracks.hits >= self.settings.confirm))
-        means, Sigma = self._foresight.positions(tracks.beliefs)
-        Sigma *= self.settings.spread**2
+        tracks = tracks.at(np.flatnonzero(tracks.hits >= self.settings.confirmations))
+        means, Sigma = self._prediction.positions(tracks.beliefs)
+        Sigma *= self.settings.std_inflation**2
         return unchecked_predictions(means, Sigma, self._radius, now, tracks.names)
 
     def _later(self, time: float) -> float:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from instances import obstacle
 
 from scp_mpc import BoundsError, InvalidArgumentError, NotFiniteError, ObstaclePrediction
-from scp_mpc.obstacles import aged
+from scp_mpc.obstacles import propagated
 
 DT = 0.2
 
@@ -42,7 +42,7 @@ def steady(dim, growth=0.05, rows=9):
 
 
 def slowly(prediction, age, dt, growth):
-    """`aged`, row by row and word by word."""
+    """`propagated`, row by row and word by word."""
     mu, Sigma, N = prediction.means, prediction.covariances, prediction.horizon
     means, covariances = [], []
     values, vectors = np.linalg.eigh(Sigma[N] - Sigma[N - 1])
@@ -72,7 +72,7 @@ growths = st.floats(0.0, 2.0)
 @given(seeds, dims, ages, growths, st.integers(2, 12))
 def test_agrees_with_the_slow_computation(seed, dim, age, growth, rows):
     prediction = drawn(seed, rows, dim)
-    result = aged(prediction, age, DT, growth)
+    result = propagated(prediction, age, DT, growth)
     means, covariances = slowly(prediction, age, DT, growth)
     np.testing.assert_allclose(result.means, means, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(result.covariances, covariances, rtol=1e-9, atol=1e-9)
@@ -84,11 +84,11 @@ def test_agrees_with_the_slow_computation(seed, dim, age, growth, rows):
 @given(seeds, dims, ages, growths)
 def test_what_is_returned_could_have_been_made_from_scratch(seed, dim, age, growth):
     """The result is not checked, so it must need no check: same spread, read-only, valid."""
-    result = aged(drawn(seed, dim=dim), age, DT, growth)
+    result = propagated(drawn(seed, dim=dim), age, DT, growth)
     again = ObstaclePrediction(result.means, result.covariances, result.radius)
-    np.testing.assert_allclose(result.spread, again.spread, rtol=1e-12)
+    np.testing.assert_allclose(result.largest_std, again.largest_std, rtol=1e-12)
     if age > 0:
-        for array in (result.means, result.covariances, result.spread):
+        for array in (result.means, result.covariances, result.largest_std):
             with pytest.raises(ValueError, match="read-only"):
                 array[...] = 1.0
 
@@ -97,8 +97,8 @@ def test_what_is_returned_could_have_been_made_from_scratch(seed, dim, age, grow
 @given(seeds, dims, ages, growths)
 def test_never_more_certain_than_the_prediction_was_for_that_time(seed, dim, age, growth):
     prediction = drawn(seed, dim=dim)
-    result, N = aged(prediction, age, DT, growth), prediction.horizon
-    ungrown = aged(prediction, age, DT, 0.0)
+    result, N = propagated(prediction, age, DT, growth), prediction.horizon
+    ungrown = propagated(prediction, age, DT, 0.0)
     for i in range(N + 1):
         more = result.covariances[i] - ungrown.covariances[i]
         assert positive(more - 0.999999 * age * growth * np.eye(dim))
@@ -108,22 +108,22 @@ def test_never_more_certain_than_the_prediction_was_for_that_time(seed, dim, age
 
 def test_whole_intervals_shift_the_rows():
     prediction = drawn(3)
-    result = aged(prediction, 3 * DT, DT, 0.0)
+    result = propagated(prediction, 3 * DT, DT, 0.0)
     np.testing.assert_allclose(result.means[:6], prediction.means[3:], atol=1e-12)
     np.testing.assert_allclose(result.covariances[:6], prediction.covariances[3:], atol=1e-12)
 
 
 def test_age_zero_changes_nothing():
     prediction = drawn(1)
-    assert aged(prediction, 0.0, DT, 0.1) is prediction
+    assert propagated(prediction, 0.0, DT, 0.1) is prediction
 
 
 @settings(max_examples=100, deadline=None)
 @given(dims, ages, ages, growths)
 def test_two_ages_in_a_row_are_one(dim, first, second, growth):
     prediction = steady(dim)
-    twice = aged(aged(prediction, first, DT, growth), second, DT, growth)
-    once = aged(prediction, first + second, DT, growth)
+    twice = propagated(propagated(prediction, first, DT, growth), second, DT, growth)
+    once = propagated(prediction, first + second, DT, growth)
     np.testing.assert_allclose(twice.means, once.means, atol=1e-9)
     np.testing.assert_allclose(twice.covariances, once.covariances, atol=1e-9)
     assert twice.stamp == pytest.approx(once.stamp)
@@ -132,27 +132,27 @@ def test_two_ages_in_a_row_are_one(dim, first, second, growth):
 
 def test_a_shrinking_covariance_stays():
     shrinking = obstacle(8, (1.0, 0.0), growth=-0.05)
-    result = aged(shrinking, 4.0, DT, 0.0)
+    result = propagated(shrinking, 4.0, DT, 0.0)
     np.testing.assert_array_equal(result.covariances, np.tile(shrinking.covariances[-1], (9, 1, 1)))
 
 
 def test_a_covariance_that_turns_grows_where_it_grew():
     Sigma = np.diag([1.0, 1.0]) + np.arange(9)[:, None, None] * np.diag([0.1, -0.1])
-    result = aged(ObstaclePrediction(np.zeros((9, 2)), Sigma, 0.2), 2.0, DT, 0.0)
+    result = propagated(ObstaclePrediction(np.zeros((9, 2)), Sigma, 0.2), 2.0, DT, 0.0)
     np.testing.assert_allclose(result.covariances[-1], np.diag([2.8, 0.2]))
 
 
 @pytest.mark.parametrize("age", [1e3, 1e6, 1e9])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_large_ages_stay_finite(age, dim):
-    result = aged(steady(dim), age, DT, 0.1)
+    result = propagated(steady(dim), age, DT, 0.1)
     assert np.isfinite(result.means).all()
     assert (np.linalg.eigvalsh(result.covariances) > 0).all()
 
 
 @pytest.mark.parametrize("covariance", [np.zeros((2, 2)), np.diag([1.0, 0.0]), 1e12 * np.eye(2)])
 def test_singular_and_huge_covariances_age(covariance):
-    result = aged(obstacle(8, (1.0, 0.0), covariance=covariance), 0.33, DT, 0.1)
+    result = propagated(obstacle(8, (1.0, 0.0), covariance=covariance), 0.33, DT, 0.1)
     ObstaclePrediction(result.means, result.covariances, 0.2)
 
 
@@ -168,7 +168,7 @@ def test_singular_and_huge_covariances_age(covariance):
 )
 def test_bad_ages_are_refused(arguments, message):
     with pytest.raises((BoundsError, NotFiniteError), match=message):
-        aged(steady(2), *arguments)
+        propagated(steady(2), *arguments)
 
 
 def test_stamps_and_names_are_optional_and_checked():
@@ -177,7 +177,7 @@ def test_stamps_and_names_are_optional_and_checked():
     known = replace(plain, stamp=np.float32(2.0), name=("track", 7))
     assert (known.stamp, known.name) == (2.0, ("track", 7))
     np.testing.assert_array_equal(known.means, plain.means)
-    np.testing.assert_array_equal(known.spread, plain.spread)
+    np.testing.assert_array_equal(known.largest_std, plain.largest_std)
     for stamp in (np.nan, np.inf):
         with pytest.raises(NotFiniteError, match="stamp"):
             replace(plain, stamp=stamp)

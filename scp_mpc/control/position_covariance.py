@@ -28,38 +28,44 @@ from scp_mpc.control.regulator import Regulator
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.problem import Problem
 
-Foresight = Literal["none", "open loop", "closed loop"]
+Prediction = Literal["none", "open loop", "closed loop"]
 _SETTLED = 1e-6  # relative change of a covariance that is none
 
 
-class PositionSpread:
+class PositionCovariance:
     """Covariance of the robot's position along the horizon.
 
     Args:
         problem: Without the disturbance: horizon, and weights of the feedback.
         estimator: Of state and disturbance.
-        foresight: Which inputs are to come, "open loop" or "closed loop"; "none": do not ask.
-        thrift: Of the feedback; see `Regulator`.
+        prediction: Which inputs are to come, "open loop" or "closed loop"; "none": do not ask.
+        terminal_input_weight: Of the feedback; see `Regulator`.
 
     Raises:
-        InvalidArgumentError: No such foresight, or no feedback stabilises the robot.
+        InvalidArgumentError: No such prediction, or no feedback stabilises the robot.
     """
 
     def __init__(
         self,
         problem: Problem,
         estimator: DisturbanceEstimator,
-        foresight: Foresight,
-        thrift: float = 1.0,
+        prediction: Prediction,
+        terminal_input_weight: float = 1.0,
     ) -> None:
         """Find the feedback."""
-        if foresight not in get_args(Foresight):
-            names = ", ".join(map(repr, get_args(Foresight)))
-            raise InvalidArgumentError("foresight", f"{foresight!r} is none of {names}")
-        self._estimator, self._horizon, self._foresight = estimator, problem.horizon, foresight
-        if foresight == "closed loop":
+        if prediction not in get_args(Prediction):
+            names = ", ".join(map(repr, get_args(Prediction)))
+            raise InvalidArgumentError("prediction", f"{prediction!r} is none of {names}")
+        self._estimator, self._horizon, self._prediction = (
+            estimator,
+            problem.horizon,
+            prediction,
+        )
+        if prediction == "closed loop":
             model = estimator.model
-            self._loop = model.A - model.B @ Regulator(problem, model, thrift).feedback
+            self._loop = (
+                model.A - model.B @ Regulator(problem, model, terminal_input_weight).feedback
+            )
         self.reset()
 
     def reset(self) -> None:
@@ -67,8 +73,8 @@ class PositionSpread:
         self._known: tuple[FloatArray, FloatArray] | None = None
 
     def along(self, covariance: FloatArray) -> FloatArray | None:
-        """Covariances (N+1, d, d) [m^2] from that of the estimate now; None without foresight."""
-        if self._foresight == "none":
+        """Covariances (N+1, d, d) [m^2] from that of the estimate now; None without prediction."""
+        if self._prediction == "none":
             return None
         known = self._known
         # It settles within a few steps; from then on there is nothing to compute.
@@ -82,7 +88,7 @@ class PositionSpread:
         spread = [S]
         for _ in range(self._horizon):
             before = known.ahead(S)
-            if self._foresight == "open loop":
+            if self._prediction == "open loop":
                 S = before
             else:
                 S = known.behind(before)

@@ -10,14 +10,14 @@ from instances import DT, obstacle, straight_reference
 from watching import NAN, controller, seen, state, step
 
 from scp_mpc import (
-    Freshness,
     NotFiniteError,
     ShapeError,
     StaleDataError,
+    StalenessPolicy,
     Status,
     TooManyObstaclesError,
 )
-from scp_mpc.obstacles import aged
+from scp_mpc.obstacles import propagated
 
 # Vanished obstacles
 
@@ -50,7 +50,7 @@ def test_a_vanished_obstacle_moves_on_and_grows_until_it_is_forgotten():
     for k in range(1, 4):
         plan = step(mpc)
         (kept,) = mpc.obstacles
-        expected = aged(report, k * DT, DT, 0.5)
+        expected = propagated(report, k * DT, DT, 0.5)
         np.testing.assert_allclose(kept.means, expected.means, atol=1e-12)
         np.testing.assert_allclose(kept.covariances, expected.covariances, atol=1e-12)
         assert plan.s.shape == (1,)
@@ -110,7 +110,7 @@ def test_a_late_report_is_moved_on_and_grown():
     assert mpc.obstacles == (fresh,)
     step(mpc, late, time=10.2)
     (used,) = mpc.obstacles
-    expected = aged(late, 0.5, DT, 0.5)
+    expected = propagated(late, 0.5, DT, 0.5)
     np.testing.assert_allclose(used.means, expected.means, atol=1e-9)
     np.testing.assert_allclose(used.covariances, expected.covariances, atol=1e-9)
     assert (np.linalg.eigvalsh(used.covariances - late.covariances) > 0.2).all()
@@ -118,7 +118,7 @@ def test_a_late_report_is_moved_on_and_grown():
 
 def test_a_late_report_is_planned_with_as_if_it_had_been_handed_over_aged():
     late = seen(stamp=9.7)
-    aged_by_hand = replace(aged(late, 0.3, DT, Freshness().growth), stamp=None)
+    aged_by_hand = replace(propagated(late, 0.3, DT, StalenessPolicy().growth), stamp=None)
     automatic, by_hand = controller(), controller()
     one, other = step(automatic, late, time=10.0), step(by_hand, aged_by_hand)
     np.testing.assert_allclose(one.X, other.X, atol=1e-9)
@@ -212,5 +212,5 @@ def test_what_was_too_old_is_kept_when_it_vanishes():
     assert step(mpc, report, time=10.0).status is Status.STALE
     step(mpc, time=10.2)
     np.testing.assert_allclose(
-        mpc.obstacles[0].covariances, aged(report, 1.7, DT, 0.1).covariances, atol=1e-9
+        mpc.obstacles[0].covariances, propagated(report, 1.7, DT, 0.1).covariances, atol=1e-9
     )

@@ -14,7 +14,7 @@ from scp_mpc.errors import BoundsError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 
 
-def aged(
+def propagated(
     prediction: ObstaclePrediction, age: float, dt: float, growth: float
 ) -> ObstaclePrediction:
     """Return the same prediction, seen `age` seconds later.
@@ -68,7 +68,7 @@ def aged(
     covariances += age * growth * np.eye(prediction.dim)
     require_finite("age", np.append(means[N], covariances[N]))  # nothing else is as far out
     stamp = None if prediction.stamp is None else prediction.stamp + age
-    return prediction.moved(means, covariances, stamp)
+    return prediction.with_rows(means, covariances, stamp)
 
 
 def _positive_part(matrix: FloatArray) -> FloatArray:
