@@ -53,8 +53,8 @@ class TrackerSettings:
     restless. Densities, weights and dwell time have the largest likelihood of what a recorded
     street scene (148 people, 5.8 at a time) did 0.4 to 4.8 s ahead, seen each 0.4 s with errors of
     5 cm. Fitted to its first half, they lose 0.02 nats per sample on the second against those
-    fitted to all of it. Against one constant velocity they gain 0.09; turns, `WALKING_AND_TURNING`, gain
-    another 0.01 and are left out.
+    fitted to all of it. Against one constant velocity they gain 0.09; turns,
+    `WALKING_AND_TURNING`, gain another 0.01 and are left out.
 
     People have heavier tails than any Gaussian: over that scene, ellipses for 50, 90 and 95 % hold
     54 to 67, 88 to 91 and 93 %, so that what is beyond 95 % is 7 % rather than 5.
