@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test check format bench risk soak wind clean
+.PHONY: demo test test-all check format bench risk soak wind clean
 
 demo: $(VENV)/.demo  ## run the report's four scenarios; tables and pictures go to out/
 	$(BIN)/scp-mpc report --out $(OUT)
 
-test: $(VENV)/.dev  ## run all tests
+test: $(VENV)/.dev  ## run the tests that everybody runs
 	$(BIN)/python -m pytest
+
+test-all: $(VENV)/.dev  ## the slow ones, too: soak, Monte Carlo, notebooks, large random runs
+	$(BIN)/python -m pytest -m ""
 
 check: $(VENV)/.dev  ## lint, format, docstrings, strict types
 	$(BIN)/ruff check .

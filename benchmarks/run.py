@@ -10,17 +10,37 @@ deadlines   closed loops among 12 obstacles with a deadline, and how late their 
 optimality  plan costs against the best of 24 starts of IPOPT
 programs    QP solvers on recorded programs
 robots      closed loops of all robots, relative to the double integrator among 5 obstacles
+scenarios   the report's four scenarios, 600 steps each
+ablation    what the parts of the loop and its solver's options are worth
 """
 
 import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import deadlines, horizon_timing, optimality, programs, robots, scaling
+from benchmarks import (
+    ablation,
+    deadlines,
+    horizon_timing,
+    optimality,
+    programs,
+    robots,
+    scaling,
+    scenarios,
+)
 from benchmarks.processes import in_one_thread
 from benchmarks.tables import write
 
-BENCHMARKS = ("horizon", "scaling", "deadlines", "optimality", "programs", "robots")
+BENCHMARKS = (
+    "horizon",
+    "scaling",
+    "deadlines",
+    "optimality",
+    "programs",
+    "robots",
+    "scenarios",
+    "ablation",
+)
 
 
 def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], object]) -> None:
@@ -47,9 +67,13 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], objec
     elif name == "optimality":
         found = in_one_thread(optimality.rows, steps, optimality.STARTS, seed)
         write(out, optimality.NAME, optimality.markdown(found), {"rows": found}, echo=echo)
-    elif name == "programs":
-        found = in_one_thread(programs.rows, steps)
-        write(out, programs.NAME, programs.markdown(found), {"rows": found}, echo=echo)
+    elif name == "scenarios":
+        found = in_one_thread(scenarios.rows)
+        write(out, scenarios.NAME, scenarios.markdown(found), {"rows": found}, echo=echo)
+    elif name in ("programs", "ablation"):
+        plain = {"programs": programs, "ablation": ablation}[name]
+        found = in_one_thread(plain.rows, steps)
+        write(out, plain.NAME, plain.markdown(found), {"rows": found}, echo=echo)
     else:
         which = {"deadlines": deadlines, "robots": robots}[name]
         found = in_one_thread(which.rows, steps)

@@ -41,11 +41,12 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of this checkout, marked if files differ; None outside of one."""
+    """The commit of this checkout, marked if sources differ; None outside of one."""
     # An installed package may lie within somebody else's repository, which does not track it.
     if _git("ls-files", "--error-unmatch", "problem.py") is None:
         return None
-    return _git("describe", "--always", "--dirty")
+    commit = _git("describe", "--always")
+    return f"{commit}-dirty" if commit and _git("diff", "--name-only", "HEAD", ":/*.py") else commit
 
 
 def _git(*arguments: str) -> str | None:

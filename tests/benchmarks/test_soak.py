@@ -19,6 +19,7 @@ REF = straight_reference(N)
 WRONG = ("invalid", "lies", "escaped", "traces")
 
 
+@pytest.mark.slow
 def test_twenty_thousand_steps_and_their_resumption(tmp_path):
     shown = []
     total = run_soak(tmp_path, steps=20_000, chunk=1_000, echo=shown.append)

@@ -38,23 +38,34 @@ def hold(problem, step, settings):
     assert judge(problem, *step.given, plan).complaints == []
 
 
-@profile(200)
+@pytest.mark.parametrize(
+    "settings", KINDS, ids=["default", "one", "piqp", "piqp one", "no time", "piqp no time"]
+)
+@profile(80)
 @given(st.data())
-def test_in_the_plane(data):
-    problem = data.draw(problems())
-    hold(problem, data.draw(steps(problem)), Settings())
-
-
-@pytest.mark.parametrize("settings", KINDS[1:], ids=["one", "piqp", "piqp one", "no time", "-"])
-@profile(90)
-@given(st.data())
-def test_in_the_plane_with_other_settings(settings, data):
+def test_in_the_plane(settings, data):
     problem = data.draw(problems(horizons=(3, 8)))
     hold(problem, data.draw(steps(problem)), settings)
 
 
-@profile(100)
+@profile(30)
 @given(st.data())
 def test_in_space(data):
+    problem = data.draw(problems(dim=3, horizons=(1, 5)))
+    hold(problem, data.draw(steps(problem)), data.draw(st.sampled_from([KINDS[0], KINDS[2]])))
+
+
+@pytest.mark.slow
+@profile(1000)
+@given(st.data())
+def test_many_in_the_plane(data):
+    problem = data.draw(problems())
+    hold(problem, data.draw(steps(problem)), data.draw(st.sampled_from(KINDS)))
+
+
+@pytest.mark.slow
+@profile(300)
+@given(st.data())
+def test_many_in_space(data):
     problem = data.draw(problems(dim=3, horizons=(1, 5)))
     hold(problem, data.draw(steps(problem)), data.draw(st.sampled_from([KINDS[0], KINDS[2]])))

@@ -48,7 +48,7 @@ def test_08_same_bits_in_every_run_process_and_after_reset():
     drive(mpc, 3)
     mpc.reset()
     assert bits(drive(mpc, 12)) == here
-    command = [sys.executable, "-c", BITS, str(Path(__file__).parent)]
+    command = [sys.executable, "-c", BITS, str(Path(__file__).parents[1] / "support")]
     for seed in ("1", "2"):  # of Python's hashes
         done = subprocess.run(
             command,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "scp_mpc"
 FLOORS = [
     {"errors", "arrays", "deadline", "provenance", "trajectory"},

@@ -21,7 +21,7 @@ from scp_mpc.report import history_figure
 from scp_mpc.report.canvas import HALF_PLANE
 from scp_mpc.simulation import SCENARIOS
 
-EXAMPLE = Path(__file__).parent.parent / "examples" / "see_scp_at_work.py"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "see_scp_at_work.py"
 KEPT = Settings(history=True)
 
 

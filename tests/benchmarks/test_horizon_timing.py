@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SOLVERS = ("scp_mpc", "scp_mpc, one start", "ipopt", "slsqp")
 EVERYBODY = [(solver, horizon) for horizon in (8, 30) for solver in SOLVERS]
 
