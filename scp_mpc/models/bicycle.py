@@ -27,6 +27,9 @@ class KinematicBicycle(ComponentModel):
         p' = v (cos, sin)(theta) + l omega (-sin, cos)(theta)
         theta' = omega,  v' = a,  delta' = sigma
 
+        x = [p1, p2, theta, v, delta]   position [m], heading [rad], speed [m/s], steering [rad]
+        u = [a, sigma]                  acceleration [m/s^2], steering rate [rad/s]
+
     The position is the point of the car's axis `rear` ahead of the rear axle, and v the speed of
     that axle: so the rolling needs no slip angle, wherever the point is. Put it in the middle of
     the disc that stands for the car. Singular at delta = +-pi/2 only: bound it.

@@ -8,7 +8,10 @@ from scp_mpc.models.linear import LinearModel
 
 
 class DoubleIntegrator(LinearModel):
-    """Point mass with x = [p1, v1, p2, v2, ...] and u = [a1, a2, ...].
+    """A point mass driven by accelerations.
+
+        x = [p1, v1, p2, v2, ...]   position [m] and velocity [m/s] of each axis
+        u = [a1, a2, ...]           acceleration [m/s^2]
 
     Each axis is discretised exactly for an input held over the interval:
     p+ = p + dt v + dt^2/2 a,  v+ = v + dt a.

@@ -24,6 +24,10 @@ from scp_mpc.models.runge_kutta import ComponentModel
 class PlanarQuadrotor(ComponentModel):
     """p' = v, v' = T (sin phi, cos phi) - (0, g), phi' = omega, omega' = alpha.
 
+        x = [p1, p2, phi, v1, v2, omega]    position across and up [m], tilt [rad], velocity [m/s],
+                                            tilt rate [rad/s]
+        u = [T, alpha]                      thrust per mass [m/s^2], angular acceleration [rad/s^2]
+
     A positive tilt leans towards +p1. The tilt is no heading: the robot moves where it likes.
 
     Args:

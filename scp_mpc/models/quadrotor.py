@@ -28,6 +28,10 @@ class Quadrotor(ComponentModel):
 
         phi' = q1 + tan(theta) turn,  theta' = tilt,  psi' = turn / cos(theta)
 
+        x = [p1, p2, p3, v1, v2, v3, phi, theta, psi]   position [m], z up, velocity [m/s], roll,
+                                                        pitch and yaw [rad]
+        u = [T, q1, q2, q3]                             thrust per mass [m/s^2], body rates [rad/s]
+
     Singular at theta = +-pi/2, the nose straight up or down: bound the pitch where a plan might
     come near. Upside down about the roll axis is regular.
 

@@ -29,6 +29,9 @@ _IDENTITY = np.eye(4, 6)
 class Unicycle(NonlinearModel):
     """p' = v (cos theta, sin theta), theta' = omega, v' = a, integrated exactly for held inputs.
 
+        x = [p1, p2, theta, v]      position [m], heading [rad], speed [m/s]
+        u = [a, omega]              acceleration [m/s^2], turn rate [rad/s]
+
     With the angle halfway, theta + mu, and the mean speed, v + alpha, the way is
 
         h exp(i (theta + mu)) (  (v + alpha) j_0(mu) + i alpha j_1(mu)  )

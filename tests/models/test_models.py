@@ -1,5 +1,7 @@
 """Models: discretisation, derivatives, and what the solver asks of every robot."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +10,14 @@ from models import DT, MODELS, OWN, draw, unicycle_rates
 from scipy.integrate import solve_ivp
 from scipy.special import spherical_jn
 
-from scp_mpc.models import KinematicBicycle, Model, PlanarQuadrotor, Quadrotor, Unicycle
+from scp_mpc.models import (
+    DoubleIntegrator,
+    KinematicBicycle,
+    Model,
+    PlanarQuadrotor,
+    Quadrotor,
+    Unicycle,
+)
 from scp_mpc.models.bessel import bessel, bessel_pair
 
 every = pytest.mark.parametrize("name", MODELS)
@@ -221,3 +230,11 @@ def test_a_brake_thrusts_by_what_its_axis_has_of_the_wanted_force(name, start, s
     assert np.isfinite(model.stopping_input(far)).all()
     if name == "quadrotor":
         assert model.derivative(x, model.stopping_input(x))[8] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "model", [DoubleIntegrator, Unicycle, KinematicBicycle, PlanarQuadrotor, Quadrotor]
+)
+def test_a_robot_says_which_state_and_input_is_which(model):
+    assert re.search(r"^ +x = \[.*\] .*\[m\]", model.__doc__, flags=re.MULTILINE)
+    assert re.search(r"^ +u = \[.*\] ", model.__doc__, flags=re.MULTILINE)
