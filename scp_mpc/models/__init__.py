@@ -8,7 +8,6 @@ from scp_mpc.models.linear import LinearModel
 from scp_mpc.models.model import (
     Linearisation,
     Model,
-    NonlinearModel,
 )
 from scp_mpc.models.planar_quadrotor import PlanarQuadrotor
 from scp_mpc.models.quadrotor import Quadrotor
@@ -29,7 +28,6 @@ __all__ = [
     "LinearModel",
     "Linearisation",
     "Model",
-    "NonlinearModel",
     "PlanarQuadrotor",
     "Quadrotor",
     "Unicycle",

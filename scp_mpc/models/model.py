@@ -171,10 +171,6 @@ class Model(ABC):
             )
 
 
-class NonlinearModel(Model):
-    """A model whose A and B depend on state and input."""
-
-
 def as_period(dt: object) -> float:
     """Return the sampling time [s].
 

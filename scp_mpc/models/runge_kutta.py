@@ -26,13 +26,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.models.model import Linearisation, NonlinearModel, differences, joined
+from scp_mpc.models.model import Linearisation, Model, differences, joined
 
 _NODES = (0.0, 0.5, 0.5, 1.0)
 _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
-class ContinuousModel(NonlinearModel):
+class ContinuousModel(Model):
     """x' = g(x, u), in `substeps` Runge-Kutta steps per interval with the input held."""
 
     substeps: int

@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.models.bessel import bessel, bessel_pair
-from scp_mpc.models.model import Linearisation, NonlinearModel, as_period, courses, indices
+from scp_mpc.models.model import Linearisation, Model, as_period, courses, indices
 
 ComplexArray = NDArray[np.complex128]
 _IDENTITY = np.eye(4, 6)
 
 
 @dataclass(frozen=True, eq=False)
-class Unicycle(NonlinearModel):
+class Unicycle(Model):
     """p' = v (cos theta, sin theta), theta' = omega, v' = a, integrated exactly for held inputs.
 
         x = [p1, p2, theta, v]      position [m], heading [rad], speed [m/s]
