@@ -1,8 +1,12 @@
-"""Coverage over lead time: how much the ellipses hold, and how large the errors are."""
+"""Coverage: how often the truth lay within the predicted ellipses, as a table and a figure."""
+
+from dataclasses import asdict
+from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from scp_mpc.provenance import provenance
 from scp_mpc.report.canvas import (
     HALF_PLANE,
     LIMIT,
@@ -61,3 +65,38 @@ def coverage_figure(coverage: Coverage) -> Figure:
         axes.set_xlabel("lead time [s]")
     legend_below(figure, (shares, errors), columns=2)
     return figure
+
+
+def coverage_table(coverage: Coverage) -> list[list[str]]:
+    """Return header and rows, ready to be printed; shares with their standard error."""
+    header = [
+        "Lead\n[s]",
+        "Samples",
+        "People",
+        "Mean\nerror\n[m]",
+        "RMS\nerror\n[m]",
+        "Pre-\ndicted\n[m]",
+    ]
+    header += ["NEES", *(f"within\n{100 * level:g} %\n[%]" for level in coverage.levels)]
+    rows = [
+        [
+            f"{row.lead:.1f}",
+            str(row.samples),
+            str(row.people),
+            f"{row.mean_error:.2f}",
+            f"{row.rms_error:.2f}",
+            f"{row.rms_predicted:.2f}",
+            f"{row.nees:.2f}",
+            *(
+                f"{100 * share:.1f}±{100 * error:.1f}"
+                for share, error in zip(row.shares, row.errors, strict=True)
+            ),
+        ]
+        for row in coverage.leads
+    ]
+    return [header, *rows]
+
+
+def coverage_numbers(coverage: Coverage) -> dict[str, Any]:
+    """Return everything, ready for JSON."""
+    return {**asdict(coverage), "provenance": provenance()}
