@@ -1,39 +1,58 @@
 """Where the time of one control step goes, and whether what comes next still fits in."""
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from heapq import nlargest
 from math import inf
 from time import perf_counter
 
-_FORGET = 0.02  # of the difference to a shorter time, each time it is measured
+_WINDOW = 40  # measurements of a task that are remembered
+_SPIKE = 3.0  # times the next longest: one beyond that was a hiccup, if what followed it was not
 _LEAST = 1e-6  # [s] of any task
-_EASE = 0.98  # of a time, each time that it stood in the way: or one hiccup would do so for ever
+_PATIENCE = 3  # times that a task is not begun before it is tried all the same; then twice as many
+_MOST_PATIENCE = 48
 
 
 class Pace:
-    """How long tasks took lately: their longest times, slowly forgotten.
+    """How long tasks took lately, at the longest, but for a single hiccup that has passed.
 
     One serves all steps of a controller, so that the first iteration of a step is predicted from
-    those of earlier steps.
+    those of earlier steps. A task that seems too long is tried again after a while, for nothing is
+    learnt about what is never begun; if it is still too long, after twice as long a while.
     """
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
-        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._seconds: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_WINDOW))
+        self._waited: defaultdict[str, int] = defaultdict(int)
+        self._patience: defaultdict[str, int] = defaultdict(lambda: _PATIENCE)
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
-        return self._seconds[task]
+        known = self._seconds[task]
+        longest = nlargest(2, known)
+        if len(longest) == 2 and longest[0] > _SPIKE * longest[1] and known[-1] < longest[0]:
+            return longest[1]
+        return longest[0] if longest else 0.0
 
     def learn(self, task: str, seconds: float) -> None:
         """Take note of a measured time."""
-        known = self._seconds[task]
-        self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
+        if self._waited[task] or self._patience[task] > _PATIENCE:  # it stood in the way
+            if seconds <= self.expected(task) / 2:
+                self._seconds[task].clear()
+                self._patience[task] = _PATIENCE
+            self._waited[task] = 0
+        self._seconds[task].append(seconds)
 
-    def ease(self, task: str) -> None:
-        """Expect a little less, after a task was not begun."""
-        self._seconds[task] *= _EASE
+    def tries(self, task: str) -> bool:
+        """Whether to begin a task that is expected to take too long, to see whether it does."""
+        self._waited[task] += 1
+        if self._waited[task] <= self._patience[task]:
+            return False
+        self._waited[task] = 0
+        self._patience[task] = min(2 * self._patience[task], _MOST_PATIENCE)
+        return True
 
 
 class Clock:
@@ -54,6 +73,7 @@ class Clock:
         self.spent: defaultdict[str, float] = defaultdict(float)
         self._began = self._lap = perf_counter()
         self._booked = 0.0  # [s] of tasks
+        self._tried: set[str] = set()  # to be begun although they seem too long, and not begun yet
 
     def elapsed(self) -> float:
         """Seconds since the step began."""
@@ -69,11 +89,10 @@ class Clock:
         """Whether a task, and what ends the step, are predicted to end before the deadline."""
         if self._deadline == inf:
             return True
-        needed = self._pace.expected(task) + self._pace.expected("ending")
-        if needed <= self._deadline - self.elapsed():
+        needed, left = self._pace.expected(task), self._deadline - self.elapsed()
+        if needed + self._pace.expected("ending") <= left:
             return True
-        self._pace.ease(task)
-        return False
+        return left > 0 and self._tries(task)
 
     def room(self, task: str, most: int, then: str = "") -> int:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
@@ -82,9 +101,7 @@ class Clock:
         after = self._pace.expected(then) + self._pace.expected("ending")
         spare = self._deadline - self.elapsed() - after
         times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
-        if times < most:
-            self._pace.ease(task)
-        return times
+        return 1 if times == 0 and most > 0 and spare > 0 and self._tries(task) else times
 
     @contextmanager
     def task(self, name: str) -> Iterator[None]:
@@ -93,6 +110,7 @@ class Clock:
         yield
         own = self.elapsed() - began - (self._booked - booked)
         self._booked += own
+        self._tried.discard(name)
         self._pace.learn(name, own)
 
     def learn(self, task: str, since: float, times: int = 1) -> None:
@@ -100,4 +118,10 @@ class Clock:
         if times:
             seconds = self.elapsed() - since
             self._booked += seconds
+            self._tried.discard(task)
             self._pace.learn(task, seconds / times)
+
+    def _tries(self, task: str) -> bool:
+        if task not in self._tried and self._pace.tries(task):
+            self._tried.add(task)
+        return task in self._tried

@@ -1,5 +1,6 @@
 """Predicted times, and what is booked to whom; the clock is read through a fake."""
 
+import numpy as np
 import pytest
 
 from scp_mpc import deadline
@@ -41,11 +42,41 @@ def test_nothing_begins_that_would_end_late(time):
     assert Clock(None, pace).room("task", 9) == 9
 
 
-@pytest.mark.usefixtures("time")
-def test_one_hiccup_does_not_stand_in_the_way_for_ever():
+def test_a_single_hiccup_is_believed_until_it_has_passed():
     pace = Pace()
-    pace.learn("task", 5.0)
-    tries = 0
+    for seconds in (0.2, 0.3, 5.0, 0.25):
+        pace.learn("task", seconds)
+    assert pace.expected("task") == 0.3
+    pace.learn("task", 4.0)
+    assert pace.expected("task") == 5.0
+    fresh = Pace()
+    fresh.learn("task", 0.2)
+    fresh.learn("task", 5.0)
+    assert fresh.expected("task") == 5.0  # until something quick comes after it
+
+
+@pytest.mark.usefixtures("time")
+@pytest.mark.parametrize("hiccups", [1, 2, 5])
+def test_hiccups_stand_in_the_way_of_a_few_steps_only(hiccups):
+    pace = Pace()
+    for _ in range(hiccups):
+        pace.learn("task", 5.0)
+    tries = 1
     while not Clock(1.0, pace).allows("task"):
         tries += 1
-    assert 0 < tries < 100
+    assert tries <= 5
+    pace.learn("task", 0.5)
+    assert pace.expected("task") == 0.5
+    assert Clock(1.0, pace).allows("task")
+
+
+@pytest.mark.usefixtures("time")
+def test_what_is_always_too_long_is_tried_ever_more_seldom():
+    pace, begun = Pace(), []
+    pace.learn("task", 5.0)
+    for k in range(1000):
+        if Clock(1.0, pace).allows("task"):
+            begun.append(k)
+            pace.learn("task", 5.0)
+    assert np.diff(begun).max() < 60
+    assert len(begun) < 30

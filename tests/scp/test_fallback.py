@@ -120,18 +120,18 @@ def test_a_safe_plan_that_is_known_beats_slack():
     assert plan.ok, plan.status
 
 
-def test_predictions_of_time_are_long_times_slowly_forgotten():
+def test_predictions_of_time_are_the_longest_of_those_that_are_remembered():
     pace = Pace()
     assert pace.expected("program") == 0
     pace.learn("program", 2.0)
     pace.learn("program", 1.0)
-    assert 1.9 < pace.expected("program") < 2.0
+    assert pace.expected("program") == 2.0
     clock = Clock(1.0, pace)
     assert not clock.allows("program")
     tries = 1
     while not clock.allows("program"):  # what was never begun must not be shut out for ever
         tries += 1
-    assert 10 < tries < 60
+    assert 1 < tries < 6
     assert Clock(None, pace).allows("program")
 
 
