@@ -157,6 +157,10 @@ class Path:
             x, k, h, np.maximum(low - start, 0.0), np.minimum(high - start, way)
         )
         best = int(gap2.argmin())
+        # Where the distance has a maximum in the window, one of its ends may be nearer.
+        ends = ((self.positions([low, high]) - x) ** 2).sum(axis=1)
+        if ends.min() < gap2[best]:
+            return (low, high)[int(ends.argmin())]
         return min(max(float(start[best] + h[best]), low), high)
 
     def _within(self, low: float, high: float) -> tuple[IntArray, FloatArray]:

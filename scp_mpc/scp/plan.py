@@ -140,8 +140,16 @@ class Plan:
 
     @property
     def ok(self) -> bool:
-        """Whether every constraint holds, so that the plan is safe to follow."""
-        return self.status.ok
+        """Whether every constraint holds, so that the plan is safe to follow: not in a contact."""
+        return self.status.ok and not self.contact
+
+    @cached_property
+    def contact(self) -> tuple[int, ...]:
+        """Obstacles that the robot touches now, if they are where they are expected to be.
+
+        No plan can undo that: stages 1 .. N are constrained. How it is left is up to the status.
+        """
+        return self.step.contact
 
     @cached_property
     def risk(self) -> PlanRisk:

@@ -23,6 +23,7 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.problem import Problem
 from scp_mpc.scp.nodes import Nodes
 
+_TOUCH = 1e-9  # [m] within another body that is not
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
 
 
@@ -146,6 +147,19 @@ class Step:
         growth = np.repeat(growth / nodes.instants, nodes.instants, axis=1)
         length: FloatArray = np.sqrt(_squared(means[:, 1:] - means[:, :-1]))
         return nodes.repeated(length + _SIGMAS * growth, axis=1)
+
+    @property
+    def contact(self) -> tuple[int, ...]:
+        """Obstacles that the robot touches now, if they are where they are expected to be."""
+        if not self.obstacles:
+            return ()
+        y = self.nodes.now(self.x0) - self.means[:, :1]  # (J, n, d)
+        gaps = np.linalg.norm(y, axis=-1)
+        if self.shapes is not None:
+            j = self.shapes.slots
+            gaps[j] = self.shapes.taken(j).distance(y[j])
+        reach = self.problem.robot_radius + np.array([o.radius for o in self.obstacles])
+        return tuple(np.flatnonzero(gaps.min(axis=1) < reach - _TOUCH).tolist())
 
     @property
     def here(self) -> FloatArray:

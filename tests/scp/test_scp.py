@@ -12,6 +12,7 @@ from scp_mpc import (
     SCP,
     DoubleIntegrator,
     ObstaclePrediction,
+    Polytope,
     QPSettings,
     Settings,
     Status,
@@ -322,3 +323,19 @@ def test_what_is_not_a_number_is_never_judged_safe(which):
     assert not verdict.certified
     if which in (1, 3):  # of feasibility and slack
         assert verdict is Status.VIOLATING
+
+
+@pytest.mark.parametrize("shape", [None, Polytope.box([1.0, 1.0])], ids=["disc", "box"])
+def test_a_contact_now_is_told_and_is_not_ok(shape):
+    """5 cm inside now, and out at the first sample: stage 0 is not constrained."""
+    case = problem(10, max_obstacles=2)
+    reach = case.robot_radius + (0.5 if shape is None else 0.5 + 0.1)
+    far = ObstaclePrediction.static(10, [9.0, 9.0], 0.2)
+    for inside, expected in ((0.05, (1,)), (-0.05, ())):
+        means, radius = [reach - inside, 0.0], 0.5 if shape is None else 0.1
+        near = ObstaclePrediction.static(10, means, radius, shape=shape)
+        away = np.tile([-3.0, 0.0, 0.0, 0.0], (11, 1))
+        plan = SCP(case).solve(np.array([0.0, -2.0, 0.0, 0.0]), away, [far, near])
+        assert plan.status.ok
+        assert plan.contact == expected
+        assert plan.ok is not bool(expected)

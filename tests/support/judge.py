@@ -84,6 +84,12 @@ def judge(problem, x0, x_ref, obstacles, plan, robot_covariance=None) -> Verdict
     allowed += 1e-10 * np.maximum(0.0, -distances).max(initial=0.0)  # all share one program
     verdict = Verdict(states, float(cost), distances, allowed)
     verdict.complaints.extend(_complaints(problem, plan, X, U, s, verdict))
+    here = x0[problem.model.position]
+    reach = [problem.robot_radius + o.radius for o in obstacles]
+    gaps = [float(np.linalg.norm(here - o.means[0])) for o in obstacles]
+    inside = [j for j, (gap, r) in enumerate(zip(gaps, reach, strict=True)) if gap < r]
+    if plan.status.name != "STALE" and list(plan.contact) != inside:
+        verdict.complaints.append(f"in contact with {inside}, not {plan.contact}")
     return verdict
 
 
@@ -210,17 +216,17 @@ def _complaints(problem, plan, X, U, s, verdict) -> list[str]:
         said.append(f"the states do not follow from the inputs by {defect:.3g}")
     if abs(plan.cost - verdict.cost) > 1e-6 * max(1.0, abs(verdict.cost)):
         said.append(f"the cost is {verdict.cost:.9g}, not {plan.cost:.9g}")
-    if plan.ok != (status in _OK) or status not in _OK + _NOT_OK:
+    if plan.ok != (status in _OK and not plan.contact) or status not in _OK + _NOT_OK:
         said.append(f"{status} may not say ok = {plan.ok}")
     violation = np.maximum(0.0, -verdict.distances)
     worst = float(violation.max(initial=0.0))
-    if plan.ok and not verdict.clear:
+    if status in _OK and not verdict.clear:
         said.append(f"{status}, but a constraint is violated by {worst:.3g} m")
     # What is violated between the samples does not show at them.
     sampled = getattr(problem, "nodes_per_interval", 1) == 1
     rounding = verdict.allowed - TOLERANCE
     holds = not (violation + rounding > TOLERANCE).any()
-    if not plan.ok and status != "STALE" and sampled and holds:
+    if status in _NOT_OK and status != "STALE" and sampled and holds:
         said.append(f"{status}, but every constraint holds (to {worst:.3g} m)")
     hidden = violation - slack - verdict.allowed
     if (hidden > 0).any():
