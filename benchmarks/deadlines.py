@@ -58,7 +58,7 @@ def figure(found: Sequence[dict[str, Any]]) -> Figure:
             axes.step(times, share, where="pre", color=colour, linestyle=line, lw=2, label=name)
             if row["deadline_ms"] is not None:
                 axes.axvline(row["deadline_ms"], color=colour, linestyle=":", linewidth=1.2)
-        plain(axes, "xy", (0.2, 0.5, 1, 2, 5, 10, 20, 50))
+        plain(axes, "xy", (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200))
         where = "the samples" if nodes == 1 else f"{nodes} nodes per interval"
         axes.set_title(f"obstacles constrained at {where}", fontsize=13)
         axes.set_xlabel("processor time of a control step [ms]", fontsize=13)
