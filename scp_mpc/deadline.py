@@ -10,6 +10,7 @@ from time import perf_counter
 _WINDOW = 40  # measurements of a task that are remembered
 _SPIKE = 3.0  # times the next longest: one beyond that was a hiccup, if what followed it was not
 _LEAST = 1e-6  # [s] of any task
+_EASE = 0.98  # of a time, each time that it stood in the way
 _PATIENCE = 3  # times that a task is not begun before it is tried all the same; then twice as many
 _MOST_PATIENCE = 48
 
@@ -46,7 +47,13 @@ class Pace:
         self._seconds[task].append(seconds)
 
     def tries(self, task: str) -> bool:
-        """Whether to begin a task that is expected to take too long, to see whether it does."""
+        """Whether to begin a task that is expected to take too long, to see whether it does.
+
+        Each time that it is not, a little less is expected: what is hardly too long is soon begun.
+        """
+        most = _EASE * self.expected(task)
+        known = [min(seconds, most) for seconds in self._seconds[task]]
+        self._seconds[task] = deque(known, maxlen=_WINDOW)
         self._waited[task] += 1
         if self._waited[task] <= self._patience[task]:
             return False
