@@ -28,13 +28,13 @@ bench: $(VENV)/.dev  ## all benchmarks; tables, figures and numbers go to benchm
 	$(BIN)/python benchmarks/run.py --out benchmarks/results
 
 risk: $(VENV)/.dev  ## promised against measured risk, by Monte Carlo
-	$(BIN)/python benchmarks/risk.py --out $(OUT)/risk
+	$(BIN)/python benchmarks/risk.py --out $(OUT)
 
 soak: $(VENV)/.dev  ## a million control steps with faults; stop it and go on as you like
-	$(BIN)/python benchmarks/soak.py --out $(OUT)/soak
+	$(BIN)/python benchmarks/soak.py --out $(OUT)
 
 wind: $(VENV)/.dev  ## tracking under wind, with and without disturbance rejection
-	$(BIN)/python benchmarks/wind.py --out $(OUT)/wind
+	$(BIN)/python benchmarks/wind.py --out $(OUT)
 
 clean:
 	rm -rf $(VENV) $(OUT) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -34,7 +34,7 @@ _MARKERS = {
 }
 _KINDS = tuple(_MARKERS)
 _MISTAKE = BLACK  # of what promises nothing between the samples
-_SPREAD = 1.065  # factor between neighbours that promise the same
+_OFFSET = 1.065  # factor between neighbours that promise the same
 _FLOOR = 2e-5
 
 
@@ -170,7 +170,7 @@ def _panel(axes: Axes, rows: Sequence[Row], promised: bool = True) -> None:
     axes.plot(span, span, color="black", linewidth=1.0, linestyle=":", label="diagonal")
     series = {(row["inflation"], row["kind"]) for row in shown}
     ordered = [(i, k) for i in _COLOURS for k in _KINDS if (i, k) in series]
-    width = _SPREAD ** (len(ordered) / 2)
+    width = _OFFSET ** (len(ordered) / 2)
     # Neighbours stand aside of the diagonal: a step for each.
     for at, delta in enumerate(deltas if promised else []):
         step = np.array([delta / width, delta * width])
@@ -179,7 +179,7 @@ def _panel(axes: Axes, rows: Sequence[Row], promised: bool = True) -> None:
         axes.plot(step, [delta, delta], color="black", linewidth=2.0, label=label)
     for place, (inflation, kind) in enumerate(ordered):
         part = [row for row in shown if (row["inflation"], row["kind"]) == (inflation, kind)]
-        shift = _SPREAD ** (place - (len(ordered) - 1) / 2)
+        shift = _OFFSET ** (place - (len(ordered) - 1) / 2)
         measured = np.array([row["measured"] for row in part])
         ends = np.array([[row["low"], row["high"]] for row in part]).T
         color = _MISTAKE if kind == "samples only" else _COLOURS[inflation]

@@ -1,6 +1,6 @@
 """The soak: a million control steps in random worlds with faults, in chunks that may be resumed.
 
-    python benchmarks/soak.py --out benchmarks/results/soak
+    python benchmarks/soak.py --out benchmarks/results
 
 Each finished chunk is a line of JSON; a rerun with the same folder does what is missing, and the
 sum of all lines is written last.

@@ -23,7 +23,7 @@ _GROUPS = {
     "calm": "No disturbance",
     "alone": "The report's wind without an obstacle",
     "others": "Other disturbances",
-    "prediction": "The robot's own spread in the no-go sets",
+    "prediction": "The robot's own covariance in the no-go sets",
     "exact": "The report's wind with exact no-go sets",
 }
 

@@ -2,9 +2,9 @@
 
 nominal         `MPC`, which knows of no disturbance
 keeps its side  the same from the last plan alone: the report's local SQP
-rejection       `WindAwareMPC`, its estimator told the kind of disturbance, spread left out
+rejection       `WindAwareMPC`, its estimator told the kind of disturbance, covariance left out
 + terminal      the same, with the cost-to-go of a regulator as terminal weight
-+ spread        the same, with the robot's own spread in the no-go sets
++ covariance      the same, with the robot's own covariance in the no-go sets
 
 The estimator gets the state; the disturbance is told by its kind only: the report's wind pushes the
 velocities and fades by 0.85 a step, anything else acts like an input and hardly fades.
@@ -82,7 +82,7 @@ class Variant:
             words += " + terminal"
         if not self.multi_start:
             words += ", keeps its side"
-        return words if self.prediction == "none" else f"{words} + spread, {self.prediction}"
+        return words if self.prediction == "none" else f"{words} + covariance, {self.prediction}"
 
     @property
     def name(self) -> str:

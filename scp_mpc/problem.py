@@ -5,7 +5,7 @@
     over       x_1..x_N, u_0..u_{N-1}, s_j, e_1..e_N
     subject to x_{i+1} = f(x_i, u_i),  x_0 given
                p_i outside the no-go set of obstacle j at stage i, sized by s_j
-               (likewise at points within the interval before i, where the robot is fast)
+               (likewise at the collision nodes within the interval before i)
                s_min <= s_j <= s_max,  u_min <= u_i <= u_max
                du_min <= u_i - u_{i-1} <= du_max  (u_{-1} the input last applied, if it is known)
                x_min - e_i <= x_i <= x_max + e_i,  e_i >= 0
@@ -71,10 +71,9 @@ class Problem:
             report's `Margin`.
         inflation: "exact" for ellipsoid (+) ball, "axes" for the report's lengthened axes.
         max_obstacles: Number of obstacle slots M in the program.
-        nodes_per_interval: Points in each interval at which the obstacles are constrained where the
-            robot's way in one interval exceeds the radii; there the radii grow by as much as is
-            needed for nothing to pass between two points. 1: the samples as they are, as in the
-            report.
+        nodes_per_interval: K, collision nodes in each interval, the sample included. Above 1 the
+            radii grow, interval by interval, so that nothing passes between two nodes. 1: the
+            samples alone, as in the report.
         slack_weight: Cost per metre of slack and stage where the constraints cannot all be met.
             The penalty is exact as long as it exceeds the obstacles' multipliers.
         x_min: Lower bounds of the states at stages 1 .. N, a number or (nx,); entries may be minus

@@ -103,7 +103,8 @@ class Settings:
         tolerance: KKT residual of the original problem at which a plan is certified.
         max_iterations: SCP iterations of one run of the loop at most; each solves one program.
         solver: Who solves the programs: "osqp", "piqp", or any solver of qpsolvers by its name.
-        multi_start: Where an obstacle shapes the plan, try to pass it on the other sides too.
+        multi_start: Where an obstacle shapes the plan, try other candidates, too: its other sides,
+            other times.
         multi_start_interval: Control steps between two such attempts while it keeps shaping the
             plan.
         max_candidates: How many of the ways past it to follow to the end; all are ranked.

@@ -1,6 +1,6 @@
 """What pushes the robot: a Kalman filter on the robot's state and the disturbance behind it.
 
-    z_{k+1} = f(z_k, u_k) + noise,  noise ~ N(0, W)         z = [x; w], see `robots/disturbed.py`
+    z_{k+1} = f(z_k, u_k) + noise,  noise ~ N(0, W)         z = [x; w], see `models/disturbed.py`
     y_k     = H z_k + noise,        noise ~ N(0, V)
 
     predict     z^- = f(z, u),  S^- = F S F' + W,           F the Jacobian of f at (z, u)
@@ -53,7 +53,7 @@ class DisturbanceEstimator:
     """Estimates a first-order Gauss-Markov disturbance, and the robot's state, from measurements.
 
     The first measurement starts it: the state is what is measured (the least one that is, where
-    that is not all of it), the disturbance zero with the spread it settles at.
+    that is not all of it), the disturbance zero with its stationary covariance.
 
     Args:
         model: The robot with its disturbance.

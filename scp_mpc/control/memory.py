@@ -66,7 +66,7 @@ class ObstacleMemory:
 
     def __init__(self, staleness: StalenessPolicy, dt: float, slots: int) -> None:
         """Start with nothing known, at no time."""
-        self._freshness = staleness
+        self._staleness = staleness
         self._dt = dt
         self._slots = slots
         self.reset()
@@ -93,7 +93,7 @@ class ObstacleMemory:
                 required is missing.
         """
         given = as_predictions(obstacles)
-        required = self._freshness.stamps == "required"
+        required = self._staleness.stamps == "required"
         now = self._now(time, required)
         plain = all(o.stamp is None and o.name is None for o in given)
         if plain and not self._reports and not (required and given):
@@ -110,7 +110,7 @@ class ObstacleMemory:
         stale = self._stale(given, since, now)
         if stale is not None:
             return Recall(now, given, stale, known)
-        late = self._freshness.grow_after
+        late = self._staleness.grow_after
         present = [self._as_of(now, o, s, late) for o, s in zip(given, since, strict=True)]
         absent = [
             self._as_of(now, report.prediction, report.since)
@@ -138,7 +138,7 @@ class ObstacleMemory:
                     f"obstacles[{j}].stamp", "missing, but staleness.stamps is 'required'"
                 )
             return now
-        if stamp - now > self._freshness.grow_after + self._dt + _TICK:
+        if stamp - now > self._staleness.grow_after + self._dt + _TICK:
             raise StaleDataError(
                 f"obstacles[{j}].stamp",
                 f"{stamp} s is {stamp - now:g} s ahead of this step's time {now} s",
@@ -147,7 +147,7 @@ class ObstacleMemory:
 
     def _kept(self, now: float, reports: Mapping[Hashable, Report]) -> dict[Hashable, Report]:
         """Named obstacles that were not reported now, but not long ago."""
-        oldest = now - self._freshness.keep - _TICK
+        oldest = now - self._staleness.keep - _TICK
         return {
             name: report
             for name, report in self._reports.items()
@@ -172,12 +172,12 @@ class ObstacleMemory:
         """The prediction moved on to the present, unless it is younger than `late` seconds."""
         if now - since <= late + _TICK:
             return prediction
-        return propagated(prediction, now - since, self._dt, self._freshness.growth)
+        return propagated(prediction, now - since, self._dt, self._staleness.growth)
 
     def _stale(
         self, given: tuple[ObstaclePrediction, ...], since: list[float], now: float
     ) -> StaleDataError | None:
-        limit = self._freshness.stop_after
+        limit = self._staleness.stop_after
         j = min(range(len(given)), key=since.__getitem__, default=None)
         if j is None or now - since[j] <= limit + _TICK:
             return None

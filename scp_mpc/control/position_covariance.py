@@ -1,17 +1,17 @@
 """How far the robot may be from its plan: what is not known now, and what the wind will add.
 
 The plan's inputs are not the ones that will be applied: the next plans react. Left out (open
-loop), the spread grows without end. An ancillary feedback u = u_plan - K (z_hat - z_plan) stands in
-for the plans to come (closed loop), with K of the linear-quadratic regulator; the estimate z_hat
-and its error are uncorrelated, so that their covariances add:
+loop), the covariance grows without end. An ancillary feedback u = u_plan - K (z_hat - z_plan)
+stands in for the plans to come (closed loop), with K of the linear-quadratic regulator; the
+estimate z_hat and its error are uncorrelated, so that their covariances add:
 
     D_{i+1} = (F - G K) D_i (F - G K)' + (S^-_{i+1} - S_{i+1}),  D_0 = 0     z_hat - z_plan
     S_{i+1} = that of the filter after measurement i + 1,        S_0 now     z - z_hat
-    spread  = D_i + S_i, the rows and columns of the position
+    covariance  = D_i + S_i, the rows and columns of the position
 
 Yan & Bitmead (2005), Incorporating state estimation into model predictive control, Automatica
 41(4); van den Berg, Abbeel & Goldberg (2011), LQG-MP, IJRR 30(7). The inputs' bounds are not seen:
-where they bite, the true spread is larger.
+where they bite, the true covariance is larger.
 
 Notation:
     F   (nz, nz)    state matrix with the disturbance       K   (nu, nz)    feedback
@@ -85,7 +85,7 @@ class PositionCovariance:
     def _propagated(self, S: FloatArray) -> FloatArray:
         known, position = self._estimator, self._estimator.model.position
         D = np.zeros_like(S)
-        spread = [S]
+        covariance = [S]
         for _ in range(self._horizon):
             before = known.ahead(S)
             if self._prediction == "open loop":
@@ -93,6 +93,6 @@ class PositionCovariance:
             else:
                 S = known.behind(before)
                 D = self._loop @ D @ self._loop.T + before - S
-            spread.append(S + D)
-        blocks = np.array(spread)[:, position[:, None], position]
+            covariance.append(S + D)
+        blocks = np.array(covariance)[:, position[:, None], position]
         return frozen((blocks + blocks.swapaxes(1, 2)) / 2)

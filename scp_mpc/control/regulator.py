@@ -8,7 +8,7 @@ The cost-to-go is |x + P^-1 P_w w|^2_P but for a term in w alone, which no input
 Moore (1990), Optimal Control: Linear Quadratic Methods, on regulators with disturbances.
 
 Notation:
-    A, B, E, alpha  as in `robots/disturbed.py`     z   (nz,)       [x; w]
+    A, B, E, alpha  as in `models/disturbed.py`     z   (nz,)       [x; w]
     P   (nx, nx)    cost-to-go of the state         P_w (nx, nw)    of state and disturbance
 """
 

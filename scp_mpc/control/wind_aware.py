@@ -1,6 +1,6 @@
 """Model predictive control that knows what pushes the robot: an estimator before the controller.
 
-measurement -> estimate of state and disturbance -> MPC with both, and the spread of the position
+measurement -> estimate of state and disturbance -> MPC with both, and the position's covariance
 
 Wind aside, nothing changes: with a disturbance of zero the plan is that of `MPC`.
 """
@@ -40,7 +40,7 @@ class WindAwareMPC:
         problem: What to solve at each step, as without a disturbance.
         estimator: Of state and disturbance; it belongs to this controller.
         settings: How to solve it.
-        prediction: What is added to the doubt about the obstacles' positions: nothing, or how far
+        prediction: What is added to the covariance of the obstacles' positions: nothing, or how far
             the robot may be from its plan, with the plans to come ("closed loop") or without
             ("open loop"); see `position_covariance.py`.
         terminal_input_weight: If given, the last state is weighed by the cost-to-go of a regulator
@@ -69,7 +69,7 @@ class WindAwareMPC:
             weight = Regulator(problem, estimator.model, terminal_input_weight).terminal_weight()
             inner = replace(inner, Qf=weight)
         easy = 1.0 if terminal_input_weight is None else terminal_input_weight
-        self._spread = PositionCovariance(problem, estimator, prediction, easy)
+        self._position_covariance = PositionCovariance(problem, estimator, prediction, easy)
         self._mpc = MPC(inner, settings)
         self._problem, self._estimator = problem, estimator
         self._applied: FloatArray | None = None
@@ -136,7 +136,7 @@ class WindAwareMPC:
         try:
             self._mpc.reset()
             self._estimator.reset()
-            self._spread.reset()
+            self._position_covariance.reset()
             self._applied = None
         finally:
             self._busy.release()
@@ -172,7 +172,7 @@ class WindAwareMPC:
                 model.joined(x_ref),
                 obstacles,
                 time=time,
-                robot_covariance=_sum(self._spread.along(now.covariance), given),
+                robot_covariance=_sum(self._position_covariance.along(now.covariance), given),
             )
         except BaseException:
             self._estimator.restore(before)

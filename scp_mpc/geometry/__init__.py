@@ -1,4 +1,4 @@
-"""Safety: no-go sets, signed distances, half-spaces and risk; knows no optimisation."""
+"""Geometry: no-go sets, signed distances, half-spaces and risk; knows no optimisation."""
 
 from scp_mpc.geometry.ellipsoid import signed_distance
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation, Inflation

@@ -1,4 +1,4 @@
-"""Robots: the discrete-time dynamics f, one family per file."""
+"""Models: the discrete-time dynamics f, one family per file."""
 
 from scp_mpc.models.bicycle import KinematicBicycle
 from scp_mpc.models.disturbed import Disturbed

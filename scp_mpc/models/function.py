@@ -144,7 +144,7 @@ class FunctionModel(ContinuousModel):
         """Return the states (..., nx) after a share of an interval with the input held."""
         if not self.discrete:
             return super().advance(states, inputs, fraction)
-        x, u, h = self._spread(states, inputs, fraction)
+        x, u, h = self._broadcast(states, inputs, fraction)
         share = h * (self.substeps / self.dt)
         return x + share * (self.derivative(x, u) - x)
 
@@ -154,7 +154,7 @@ class FunctionModel(ContinuousModel):
         """Return `advance` with its derivatives; arguments as there."""
         if not self.discrete:
             return super().linearise(states, inputs, fraction)
-        x, u, h = self._spread(states, inputs, fraction)
+        x, u, h = self._broadcast(states, inputs, fraction)
         share = h * (self.substeps / self.dt)
         still = np.eye(self.nx, self.nx + self.nu)
         both = still + share[..., None] * (self.jacobians(x, u) - still)

@@ -62,13 +62,13 @@ class ContinuousModel(Model):
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
     ) -> FloatArray:
         """Return the states (..., nx) after a share of an interval with the input held."""
-        return self._march(*self._spread(states, inputs, fraction))[1]
+        return self._march(*self._broadcast(states, inputs, fraction))[1]
 
     def linearise(
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
     ) -> Linearisation:
         """Return `advance` with its exact derivatives; arguments as there."""
-        x, u, h = self._spread(states, inputs, fraction)
+        x, u, h = self._broadcast(states, inputs, fraction)
         points, after = self._march(x, u, h)
         slopes = self.jacobians(points, np.broadcast_to(u, (len(points), *u.shape)))
         both = self._chain(slopes, h[..., None])[1]
@@ -82,7 +82,7 @@ class ContinuousModel(Model):
         fraction: ArrayLike = 1.0,
     ) -> FloatArray:
         """Return sum_k y_k (Hessian of f_k in z), (..., n, n), exactly."""
-        x, u, h = self._spread(states, inputs, fraction)
+        x, u, h = self._broadcast(states, inputs, fraction)
         points, _ = self._march(x, u, h)
         inputs = np.broadcast_to(u, (len(points), *u.shape))
         slopes = self.jacobians(points, inputs)
@@ -100,7 +100,7 @@ class ContinuousModel(Model):
         bent = self.hessian(points, inputs, m)
         return (np.swapaxes(W, -2, -1) @ (bent @ W)).sum(axis=0)
 
-    def _spread(
+    def _broadcast(
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States and inputs with the same leading axes, and h (..., 1)."""

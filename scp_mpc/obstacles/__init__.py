@@ -1,10 +1,10 @@
 """Obstacles: predicted Gaussians and shapes, predictors, the report's obstacle."""
 
 from scp_mpc.obstacles.circular import CircularObstacle
+from scp_mpc.obstacles.polytope import Polytope
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor, Predictor, ReportPredictor
 from scp_mpc.obstacles.propagation import propagated
-from scp_mpc.obstacles.shape import Polytope
 
 __all__ = [
     "CircularObstacle",

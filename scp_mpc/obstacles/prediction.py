@@ -182,9 +182,9 @@ def unchecked_predictions(
         stamp: Time of row 0 [s].
         names: n of them.
     """
-    spreads = _deviations(np.linalg.eigvalsh(covariances))
+    largest_stds = _deviations(np.linalg.eigvalsh(covariances))
     made = []
-    for mu, Sigma, largest_std, name in zip(means, covariances, spreads, names, strict=True):
+    for mu, Sigma, largest_std, name in zip(means, covariances, largest_stds, names, strict=True):
         made.append(object.__new__(ObstaclePrediction))
         made[-1]._set(mu, Sigma, radius, stamp, name, None, largest_std)
     return made

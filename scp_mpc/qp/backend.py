@@ -26,7 +26,7 @@ from scp_mpc.qp.others import PIQP, Named, installed, known
 from scp_mpc.qp.program import Backend, QuadraticProgram
 from scp_mpc.settings import QPSettings
 
-_GLANCES = 2  # runs of the solver after which a program is ranked
+_RANKING_RUNS = 2  # runs of the solver after which a program is ranked
 _DIRECT = 2  # systems up to which the active set counts as the solver's own: one, and one repair
 
 
@@ -154,7 +154,7 @@ class ProgramSolver:
         """
         self.backend.load(start)
         bound = -inf
-        for effort, _ in self.backend.stages[:_GLANCES]:
+        for effort, _ in self.backend.stages[:_RANKING_RUNS]:
             point = _run(self.backend, effort)
             if point is None:
                 bound = inf

@@ -2,7 +2,7 @@
 
 from scp_mpc.report.animation import write_animation
 from scp_mpc.report.canvas import save
-from scp_mpc.report.coverage import coverage_figure, coverage_numbers, coverage_table
+from scp_mpc.report.coverage_figure import coverage_figure, coverage_numbers, coverage_table
 from scp_mpc.report.exhibits import Exhibit, exhibits
 from scp_mpc.report.figures import FIGURES, write_figures
 from scp_mpc.report.history_figure import history_figure

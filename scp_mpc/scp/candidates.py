@@ -32,14 +32,14 @@ from scp_mpc.scp.step import Step
 MAX_CANDIDATES = 16  # in one control step, whatever the number of obstacles
 MOST_AMONG_WALLS = 32  # the same where there are polytopes
 _AROUND = 3  # stages before and after a conflict that a candidate may change
-_STILL = 1e-6  # relative motion in one stage, over the distance, that counts as none
+_NO_RELATIVE_MOTION = 1e-6  # relative motion in one stage, over the distance, that counts as none
 _MIXED = 3  # polytopes whose sides are tried in all combinations
 _COSINE = 0.9  # of the angle between two directions that count as one side
 _TOUCH = 1e-9  # [m] less than that within is not within
 _PARALLEL = 1e-9  # cosine below which a face is never reached
 # Whether to leave the no-go set away from its middle, and tau: as the free plan would, one stage
 # later or earlier, two later
-_WAYS = ((False, (0.0, -1.0, 1.0)), (True, (-2.0,)))
+_VARIANTS = ((False, (0.0, -1.0, 1.0)), (True, (-2.0,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class CandidatePath:
 
 
 @dataclass(frozen=True, eq=False)
-class Homotopy:
+class PassingPattern:
     """How a plan passes the obstacles.
 
     Attributes:
@@ -72,7 +72,7 @@ class Homotopy:
     touched: BoolArray
 
 
-def candidates(
+def candidate_paths(
     step: Step,
     free: FloatArray,
     present: FloatArray,
@@ -130,7 +130,7 @@ def _together(
             yield CandidatePath(j, mixed[0], 0.0, body.apart(free, sides))
 
 
-def varied(step: Step, way: Homotopy, s: FloatArray) -> list[FloatArray]:
+def varied(step: Step, way: PassingPattern, s: FloatArray) -> list[FloatArray]:
     """Paths that pass one polytope at one stage by another face than a way does."""
     assert step.shapes is not None
     walls = step.shapes.slots
@@ -152,7 +152,7 @@ def _elsewhere(
     return path
 
 
-def same_homotopy(step: Step, first: Homotopy, second: Homotopy) -> bool:
+def same_pattern(step: Step, first: PassingPattern, second: PassingPattern) -> bool:
     """Whether two plans are pushed by the same obstacles at the same stages on the same side."""
     K = step.nodes.count
     mine, theirs = (step.nodes.stages(p.touched).any(axis=2) for p in (first, second))
@@ -194,7 +194,7 @@ def _paths_past(
             path = elsewhere.copy()
             path[reach] = body.aside(free[None, reach], n[None])[0]
             yield CandidatePath(j, n, 0.0, path)
-    for outward, times in _WAYS:
+    for outward, times in _VARIANTS:
         shifts, sides = np.repeat(times, len(normals)), np.tile(np.array(normals), (len(times), 1))
         moved = free[reach] + shifts[:, None, None] * v
         paths = np.repeat(elsewhere[None], len(sides), axis=0)
@@ -215,7 +215,7 @@ def _directions(
 ) -> tuple[FloatArray, list[FloatArray]]:
     begin, end = max(points[0] - count, 0), min(points[-1] + count, len(relative) - 1)
     v = (relative[end] - relative[begin]) * (count / max(end - begin, 1))
-    if np.linalg.norm(v) <= _STILL * np.linalg.norm(relative[begin]):
+    if np.linalg.norm(v) <= _NO_RELATIVE_MOTION * np.linalg.norm(relative[begin]):
         v = relative[begin] if relative[begin].any() else np.eye(len(v))[0]
     # The rows of the rotation that takes v onto the first axis: the others are square to it.
     square = np.linalg.svd(v[None])[2][1:]

@@ -34,7 +34,7 @@ _STRONG = 1e-6  # force, relative to the largest, from which a constraint is str
 _TOUCH = 1e-7  # distance to a constraint that is none
 _DEPENDENT = 1e-12  # of the largest eigenvalue of rows rows': none
 _LEAST = 1e-300
-BENT = 1e-6  # of the largest curvature: what is less is taken for flat
+CURVATURE_TOLERANCE = 1e-6  # of the largest curvature: what is less is taken for flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ def least_curvature(
     """
     weak = force <= _STRONG * max(1.0, float(force.max(initial=0.0)))
     least, direction = _smallest(W, bends, rows[~weak])
-    if least >= -BENT or not weak.any():
+    if least >= -CURVATURE_TOLERANCE or not weak.any():
         return least, direction
     along = rows[weak] @ direction
     if (along >= -_TOUCH).all() or (along <= _TOUCH).all():

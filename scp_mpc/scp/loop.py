@@ -21,14 +21,14 @@ from math import inf
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.scp.candidates import Homotopy, same_homotopy
+from scp_mpc.scp.candidates import PassingPattern, same_pattern
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record, recorded
 from scp_mpc.scp.iterate import NEGLIGIBLE
-from scp_mpc.scp.newton import corrected, downhill, refined
+from scp_mpc.scp.newton import negative_curvature_step, refined, second_order_correction
 from scp_mpc.scp.plan import Result, judge
 from scp_mpc.scp.transcription import Relaxation, Transcription
-from scp_mpc.scp.trust_region import Region
+from scp_mpc.scp.trust_region import TrustRegion
 
 _SURPLUS = 0.1  # of the tolerance: worth one more iteration, whose convergence is quadratic
 _LEAST_COST = 1e-3  # relative to which products of forces and gaps are judged
@@ -63,7 +63,7 @@ class Loop:
         """
         at, clock, history = self._at, self._at.clock, list[Record]()
         planes = nominal.planes if about is None else nominal.pairs.planes(about)
-        region, level, iterations = Region(at), Relaxation.NOBODY, 0
+        region, level, iterations = TrustRegion(at), Relaxation.NONE, 0
         reached: Nominal | None = None  # the last plan that was accepted
         while iterations < (limit or self._settings.max_iterations) and clock.allows("iteration"):
             with clock.task("iteration"):
@@ -88,7 +88,7 @@ class Loop:
                 continue
             accepted = region.accepts(nominal, reached, trial, program, convex, solution)
             if not accepted and not at.linear:
-                solution = corrected(program, solution, trial)
+                solution = second_order_correction(program, solution, trial)
                 trial = at.certify(program, solution)
                 accepted = region.accepts(nominal, reached, trial, program, convex, solution)
             if self._settings.history:
@@ -99,22 +99,22 @@ class Loop:
                 continue
             before = inf if reached is None else reached.residuals.worst
             nominal, reached, planes = trial, trial, trial.planes
-            level = level if trial.slack.any() or trial.excess.any() else Relaxation.NOBODY
+            level = level if trial.slack.any() or trial.excess.any() else Relaxation.NONE
             if self._is_converged(trial, before):
                 reached, direction = at.second_order(trial, program, solution)
-                away = downhill(at, reached, direction)
+                away = negative_curvature_step(at, reached, direction)
                 if away is None:
                     break
                 nominal, planes = away, away.planes
                 continue
-            if goal is not None and self._is_vain(iterations, trial, goal):
+            if goal is not None and self._is_dominated(iterations, trial, goal):
                 return None
         return None if reached is None else self.result(reached, level, iterations, tuple(history))
 
     def result(
         self,
         nominal: Nominal,
-        level: Relaxation = Relaxation.NOBODY,
+        level: Relaxation = Relaxation.NONE,
         iterations: int = 0,
         history: tuple[Record, ...] = (),
     ) -> Result:
@@ -125,7 +125,7 @@ class Loop:
         if not status.certified and residuals.feasibility > tolerance:  # then all of it counts
             nominal = replace(nominal, slack=np.maximum(-nominal.planes.g, 0.0))
         merit = at.merit(nominal.cost, float(nominal.slack.sum()), nominal.excess)
-        l1_weight = at.problem.slack_weight if level is Relaxation.EVERYBODY else inf
+        l1_weight = at.problem.slack_weight if level is Relaxation.ALL else inf
         given = nominal.cost, merit, residuals, status, iterations, nominal, history
         return Result(at.iterate(nominal, l1_weight), *given)
 
@@ -136,13 +136,13 @@ class Loop:
         enough = tolerance if before <= tolerance else _SURPLUS * tolerance
         return max(residuals.worst, product) <= enough
 
-    def _is_vain(self, iterations: int, trial: Nominal, goal: Result) -> bool:
+    def _is_dominated(self, iterations: int, trial: Nominal, goal: Result) -> bool:
         """Whether a run, whose cost falls by ever less, is far above its goal or ends there."""
         at, cost, there = self._at, trial.cost, goal.iterate
         if goal.status.ok and iterations >= _PATIENCE and cost > _FAR * goal.merit:
             return True
         if not len(trial.force) or abs(cost - goal.cost) > _ALIKE * goal.cost:
             return False
-        mine = Homotopy(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
+        mine = PassingPattern(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
         path = at.nodes.positions(there.states, there.inputs)
-        return same_homotopy(at.step, mine, Homotopy(path, there.touched[: at.step.count]))
+        return same_pattern(at.step, mine, PassingPattern(path, there.touched[: at.step.count]))

@@ -1,8 +1,8 @@
-"""Multi-start: other ways past the obstacles against the plan that is there.
+"""Multi-start: other candidates past the obstacles against the plan that is there.
 
-All ways are ranked by the programs that linearise about them. The multipliers that OSQP has after a
-few iterations bound the program's optimum from below, and tightly: most ways are cut off by that,
-and many by the multipliers that the same way had one control step before, without any iteration.
+All are ranked by the programs that linearise about them. The multipliers that OSQP has after a few
+iterations bound a program's optimum from below, and tightly: most candidates are cut off by that,
+and many by the multipliers that the same one had one control step before, without any iteration.
 The best are followed to their end, and win if they are better by enough. Where the plan needs
 slack, all are followed until one does not.
 """
@@ -18,9 +18,9 @@ from scp_mpc.qp.active_set import CondensedQP
 from scp_mpc.scp.candidates import (
     MAX_CANDIDATES,
     MOST_AMONG_WALLS,
-    Homotopy,
-    candidates,
-    same_homotopy,
+    PassingPattern,
+    candidate_paths,
+    same_pattern,
     varied,
 )
 from scp_mpc.scp.certificate import Nominal
@@ -31,10 +31,10 @@ from scp_mpc.scp.pairs import Pairs, Planes
 from scp_mpc.scp.plan import Candidate, Result
 from scp_mpc.scp.transcription import Relaxation, Transcription
 
-# A challenger must be better by this share, or the plan flickers between ways of equal cost.
+# It must be better by this share, or the plan flickers between candidates of equal cost.
 _HYSTERESIS = 0.001
-_HOPELESS = 3.0  # times the plan's own merit: more than that one program does not make good
-_BEAM = 3  # ways among polytopes that are varied
+_CUTOFF = 3.0  # times the plan's own merit: more than that one program does not make good
+_BEAM = 3  # candidates among polytopes that are varied
 _ROUNDS = 5  # of variations
 _ALIKE = 1e-6  # relative difference of merits that counts as none
 
@@ -62,7 +62,7 @@ class Ranked:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The best plan so far, the ways that were tried, and whether one of them won."""
+    """The best plan so far, the candidates that were tried, and whether one of them won."""
 
     best: Result
     tried: tuple[Candidate, ...] = ()
@@ -70,11 +70,11 @@ class Found:
 
 
 class MultiStart:
-    """Tries other ways past the obstacles.
+    """Tries other candidates past the obstacles.
 
     Args:
         at: The control steps in numbers.
-        loop: Follows the ways that look best.
+        loop: Follows the candidates that look best.
     """
 
     def __init__(self, at: Transcription, loop: Loop) -> None:
@@ -93,7 +93,7 @@ class MultiStart:
         return not clear or ((due or not best.status.ok) and best.iterate.touches)
 
     def run(self, best: Result, free: FloatArray, last: Iterate | None = None) -> Found:
-        """Rank the ways past the obstacles by one program each; follow the best of them.
+        """Rank the candidates past the obstacles by one program each; follow the best of them.
 
         Among polytopes the search is thorough where there is no plan from the step before, or where
         the one that is there is not safe.
@@ -112,24 +112,24 @@ class MultiStart:
         if not most:
             return Found(best)
         began = clock.elapsed()
-        here = Homotopy(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
+        here = PassingPattern(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
-        ways, numbers = candidates(step, free, here.path, full, most), Counter[int]()
-        if not ways:
+        candidates, numbers = candidate_paths(step, free, here.path, full, most), Counter[int]()
+        if not candidates:
             return Found(replace(best, iterate=replace(best.iterate, alternatives={})))
         keys = []
-        for way in ways:  # an obstacle's ways come in the same order in each step
-            numbers[way.obstacle] += 1
-            keys.append((way.obstacle, numbers[way.obstacle]))
+        for candidate in candidates:  # an obstacle's candidates come in the same order in each step
+            numbers[candidate.obstacle] += 1
+            keys.append((candidate.obstacle, numbers[candidate.obstacle]))
         known = {} if last is None else last.alternatives
-        about = self._present(best.nominal, free)
+        about = self._incumbent(best.nominal, free)
         old = [known.get(key) for key in keys]
-        looks = self._rank(best, about, [way.path for way in ways], old, thorough)
+        looks = self._rank(best, about, [candidate.path for candidate in candidates], old, thorough)
         ranked = [one for one in looks if one is not None]
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
-            Candidate(way.obstacle, way.normal, way.time, one.merit)
-            for way, one in zip(ways, looks, strict=True)
+            Candidate(candidate.obstacle, candidate.normal, candidate.time, one.merit)
+            for candidate, one in zip(candidates, looks, strict=True)
             if one is not None  # there was no time
         )
         duals = {k: about.duals(one) for k, one in zip(keys, looks, strict=True) if one is not None}
@@ -139,25 +139,25 @@ class MultiStart:
             follow += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
-        # A plan with slack is beaten by any without: then all ways are worth their time.
+        # A plan with slack is beaten by any without: then all candidates are worth their time.
         for one in ranked[:follow] if safe else ranked:
             if one.v is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
-            if safe and same_homotopy(step, about.passing(one), here):
-                continue  # this way leads to where we are
-            challenger = self._loop.run(about.start(one), goal, one.planes.y, hard=True)
-            if challenger is not None and challenger.beats(goal, _HYSTERESIS * goal.merit):
-                goal, switched = challenger, True
+            if safe and same_pattern(step, about.passing(one), here):
+                continue  # this candidate leads to where we are
+            end = self._loop.run(about.start(one), goal, one.planes.y, hard=True)
+            if end is not None and end.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = end, True
         # None is without slack; then the one that seems to need the least is worth a try.
         first = ranked[0] if ranked and not goal.status.ok else None
         if first is not None and first.v is not None and first.merit < goal.merit:
-            challenger = self._loop.run(about.start(first), goal, first.planes.y)
-            if challenger is not None and challenger.beats(goal, _HYSTERESIS * goal.merit):
-                goal, switched = challenger, True
+            end = self._loop.run(about.start(first), goal, first.planes.y)
+            if end is not None and end.beats(goal, _HYSTERESIS * goal.merit):
+                goal, switched = end, True
         kept = replace(goal.iterate, alternatives=duals)
         return Found(replace(goal, iterate=kept), tried, switched)
 
-    def _present(self, plan: Nominal, free: FloatArray) -> "Present":
+    def _incumbent(self, plan: Nominal, free: FloatArray) -> "Incumbent":
         """Condense about the plan that is there, with all pairs near to it or to the free one."""
         at, c = self._at, self._at.layout
         alone = plan.y.copy()
@@ -165,12 +165,12 @@ class MultiStart:
         pairs = Pairs(at.step, c, at.near(alone, at.near(plan.y, plan.pairs.near & False)))
         force = plan.pairs.table(plan.force)[pairs.obstacle, pairs.node]
         plan = replace(plan, pairs=pairs, force=force)
-        return Present(at, plan, at.linearise(plan))
+        return Incumbent(at, plan, at.linearise(plan))
 
     def _rank(
         self,
         best: Result,
-        about: "Present",
+        about: "Incumbent",
         paths: list[FloatArray],
         known: list[Duals | None],
         thorough: bool,
@@ -184,8 +184,8 @@ class MultiStart:
         ys = np.repeat(about.plan.y[None], len(paths), axis=0)
         ys[:, c.s] = at.problem.size.reference
         ys[:, c.p] = (np.stack(paths) - at.step.here).reshape(len(paths), -1)
-        relaxation = Relaxation.NOBODY if best.status.ok else Relaxation.EVERYBODY
-        limit = _HOPELESS * best.merit if best.status.ok else inf
+        relaxation = Relaxation.NONE if best.status.ok else Relaxation.ALL
+        limit = _CUTOFF * best.merit if best.status.ok else inf
         only_best = best.status.ok and not thorough and self._settings.max_candidates == 1
         programs = []
         for planes, duals in zip(about.plan.pairs.about(ys), known, strict=True):
@@ -208,7 +208,7 @@ class MultiStart:
 
     def _look(
         self,
-        about: "Present",
+        about: "Incumbent",
         planes: Planes,
         relaxation: Relaxation,
         qp: CondensedQP,
@@ -236,9 +236,9 @@ class MultiStart:
         return Ranked(merit, planes, force, qp.unbox @ away)
 
     def _searched(
-        self, best: Result, about: "Present", ranked: list[Ranked], full: FloatArray
+        self, best: Result, about: "Incumbent", ranked: list[Ranked], full: FloatArray
     ) -> list[Ranked]:
-        """Among polytopes, which face to pass at which stage is a search: the best few ways of all.
+        """Among polytopes, which face to pass at which stage is a search: the best few of all.
 
         Each is varied by one face at one stage, as long as that finds better ones.
         """
@@ -247,9 +247,9 @@ class MultiStart:
         for _ in range(_ROUNDS):
             paths = [
                 path
-                for way in beam
-                if not any(way is other for other in done)
-                for path in varied(step, about.passing(way), full)
+                for candidate in beam
+                if not any(candidate is other for other in done)
+                for path in varied(step, about.passing(candidate), full)
             ]
             done += beam
             most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
@@ -264,7 +264,7 @@ class MultiStart:
 
 
 @dataclass(frozen=True, eq=False)
-class Present:
+class Incumbent:
     """The plan that is there, about which all programs are condensed.
 
     Attributes:
@@ -277,10 +277,10 @@ class Present:
     plan: Nominal
     condensed: Condensed
 
-    def passing(self, one: Ranked) -> Homotopy:
+    def passing(self, one: Ranked) -> PassingPattern:
         """How the point that a program reached passes the obstacles."""
         force = self.plan.pairs.table(one.force[self.at.layout.bounded :])
-        return Homotopy(self.at.path(self._reached(one))[1:], force > NEGLIGIBLE)
+        return PassingPattern(self.at.path(self._reached(one))[1:], force > NEGLIGIBLE)
 
     def start(self, one: Ranked) -> Nominal:
         """The plan to which that point leads, with its multipliers."""
@@ -309,11 +309,11 @@ class Present:
         return self.condensed.y(one.v)
 
 
-def _best(ways: list[Ranked]) -> list[Ranked]:
+def _best(candidates: list[Ranked]) -> list[Ranked]:
     """The best few that can be followed and differ in cost."""
     beam: list[Ranked] = []
-    for way in sorted(ways, key=lambda way: way.merit):
-        alike = beam and way.merit - beam[-1].merit <= _ALIKE * way.merit
-        if len(beam) < _BEAM and np.isfinite(way.merit) and not alike:
-            beam.append(way)
+    for candidate in sorted(candidates, key=lambda candidate: candidate.merit):
+        alike = beam and candidate.merit - beam[-1].merit <= _ALIKE * candidate.merit
+        if len(beam) < _BEAM and np.isfinite(candidate.merit) and not alike:
+            beam.append(candidate)
     return beam

@@ -31,7 +31,7 @@ from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.active_set import QPSolution, holds
-from scp_mpc.scp.certificate import BENT, Nominal
+from scp_mpc.scp.certificate import CURVATURE_TOLERANCE, Nominal
 from scp_mpc.scp.transcription import Program, Transcription
 
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
@@ -54,7 +54,7 @@ def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolu
     return whole if whole is not None and holds(program.qp, whole) else solution
 
 
-def corrected(program: Program, solution: QPSolution, trial: Nominal) -> QPSolution:
+def second_order_correction(program: Program, solution: QPSolution, trial: Nominal) -> QPSolution:
     """The second-order correction: the least change that takes the active pairs back to g = 0.
 
     A step bends away from its linearised constraints by its square, which the merit would hold
@@ -123,7 +123,9 @@ def newton_step(solution: QPSolution, step: FloatArray, W: FloatArray) -> QPSolu
     return replace(solution, v=solution.v + z, force=force)
 
 
-def downhill(at: Transcription, saddle: Nominal, direction: FloatArray) -> Nominal | None:
+def negative_curvature_step(
+    at: Transcription, saddle: Nominal, direction: FloatArray
+) -> Nominal | None:
     """Leave a saddle along a direction (N, nu) of negative curvature; None where that is in vain.
 
     The first of some ever shorter steps, to either side, after which the merit is less.
@@ -131,7 +133,7 @@ def downhill(at: Transcription, saddle: Nominal, direction: FloatArray) -> Nomin
     problem = at.problem
     span = np.where(problem.u_max > problem.u_min, problem.u_max - problem.u_min, 1.0)
     largest = float(np.abs(direction / span).max())
-    if not (saddle.residuals.curvature < -BENT and largest > 0):
+    if not (saddle.residuals.curvature < -CURVATURE_TOLERANCE and largest > 0):
         return None
     before = _merit(at, saddle)
     s = saddle.y[at.layout.s]

@@ -8,7 +8,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.qp.program import KKTResiduals
-from scp_mpc.scp.certificate import BENT, Nominal
+from scp_mpc.scp.certificate import CURVATURE_TOLERANCE, Nominal
 from scp_mpc.scp.history import Record
 from scp_mpc.scp.iterate import Iterate, Multipliers
 from scp_mpc.scp.step import Step
@@ -109,7 +109,7 @@ class Plan:
             of a program: a linear robot's plan that ignores the obstacles. And those that nobody
             finished: "ranked", an alternative whose optimum was bounded from below; "cut", one that
             cannot win; "infeasible", one that was proved to have no solution.
-        candidates: Rival plans on other sides that were tried; `switched` if one of them won.
+        candidates: Alternative plans that were tried; `switched` if one of them won.
         timing: Seconds spent.
         iterate: The point with its multipliers, padded to all obstacle slots, at all nodes.
         history: With `Settings(history=True)`, what happened in each SCP iteration that led here.
@@ -206,6 +206,6 @@ def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
     """Return the status of a plan with the given residuals and largest slack."""
     outside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
     certified = residuals.worst <= tolerance and slack == slack
-    if certified and not residuals.curvature < -BENT:
+    if certified and not residuals.curvature < -CURVATURE_TOLERANCE:
         return Status.SOFTENED if outside else Status.CONVERGED
     return Status.VIOLATING if outside else Status.FEASIBLE

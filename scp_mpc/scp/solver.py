@@ -177,7 +177,7 @@ class SCP:
                 at.step = self._widened(step, self._motion(nominal))
             about, path = at.at(nominal), at.outputs(nominal)
             about = at.at(nominal, about=path)
-            relaxation = Relaxation.EVERYBODY if elastic else Relaxation.NOBODY
+            relaxation = Relaxation.ALL if elastic else Relaxation.NONE
             program = at.write(about, at.linearise(about), about.pairs.planes(path), relaxation)
             return program.subproblem.program.copy()
         finally:

@@ -121,18 +121,18 @@ class Step:
         return covariances
 
     @cached_property
-    def spreads(self) -> FloatArray:
+    def largest_stds(self) -> FloatArray:
         """(J, C+1) bounds of the standard deviations in any direction [m]."""
-        spreads = np.array([o.largest_std for o in self.obstacles])
+        largest_stds = np.array([o.largest_std for o in self.obstacles])
         if self.robot_covariance is None and self.nodes.count == 1 and self.scale is None:
-            return spreads
-        variances = spreads * spreads
+            return largest_stds
+        variances = largest_stds * largest_stds
         if self.robot_covariance is not None:
             variances = variances + np.trace(self.robot_covariance, axis1=1, axis2=2)
-        spreads = np.sqrt(self.nodes.interpolated(variances))
+        largest_stds = np.sqrt(self.nodes.interpolated(variances))
         if self.scale is not None:
-            spreads[:, 1:] *= self.scale
-        return spreads
+            largest_stds[:, 1:] *= self.scale
+        return largest_stds
 
     @cached_property
     def drift(self) -> FloatArray:
@@ -217,7 +217,7 @@ class Step:
             return near
         j = self.shapes.slots
         room = self.shapes.taken(j).distance(positions[1:] - self.means[j, 1:]) - self.radii[j]
-        close = room <= s[j, None] * self.spreads[j, 1:] + distance
+        close = room <= s[j, None] * self.largest_stds[j, 1:] + distance
         if known is not None:
             close &= ~known[j]
         near = np.zeros(self.radii.shape, dtype=np.bool_) if near is None else near
@@ -236,7 +236,7 @@ class Step:
         length2 = _squared(y)
         reach = self.radii + distance
         size = s[: self.count, None]
-        least = size * self.spreads[:, 1:] + reach
+        least = size * self.largest_stds[:, 1:] + reach
         unclear = length2 <= least * least
         if known is not None:
             unclear &= ~known

@@ -31,11 +31,11 @@ _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the progr
 
 
 class Relaxation(IntEnum):
-    """Who gives way where the constraints cannot all be met."""
+    """Which constraints are relaxed where they cannot all be met."""
 
-    NOBODY = 0
+    NONE = 0
     STATES = 1
-    EVERYBODY = 2
+    ALL = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class Transcription:
         )
         self._certificate = Certificate(problem, self.layout)
         self._full = np.full(problem.max_obstacles, problem.size.reference)
-        self._levels = [Relaxation.NOBODY, Relaxation.EVERYBODY]
+        self._levels = [Relaxation.NONE, Relaxation.ALL]
         if problem.limits_states:
             self._levels.insert(1, Relaxation.STATES)
 
@@ -194,7 +194,7 @@ class Transcription:
         if end.solution is None:
             return None
         self.hard.solver.finished["kkt"] += 1
-        given = condensed, self.nobody, planes, Relaxation.NOBODY, qp, self.hard
+        given = condensed, self.nobody, planes, Relaxation.NONE, qp, self.hard
         return self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
 
     def outputs(self, iterate: Iterate) -> FloatArray:
@@ -250,7 +250,7 @@ class Transcription:
         nominal: Nominal,
         condensed: Condensed,
         planes: Planes,
-        relaxation: Relaxation = Relaxation.NOBODY,
+        relaxation: Relaxation = Relaxation.NONE,
         radius: FloatArray | None = None,
         qp: CondensedQP | None = None,
     ) -> Program:
@@ -267,12 +267,12 @@ class Transcription:
         pairs, along = nominal.pairs, condensed.about.along
         if qp is None:
             qp = self.condensed_qp(condensed, pairs, planes, relaxation, radius)
-        subproblem = self.hard if relaxation is Relaxation.NOBODY else self.elastic
+        subproblem = self.hard if relaxation is Relaxation.NONE else self.elastic
         if subproblem.about is None or not (self.linear or subproblem.about is condensed.about):
             subproblem.write_dynamics(condensed.about)
         free = condensed.y_free[self.layout.boxed]
         subproblem.write_bounds(qp.lower + free, qp.upper + free, self.step.u_last)
-        everybody = relaxation is Relaxation.EVERYBODY
+        everybody = relaxation is Relaxation.ALL
         rows = subproblem.write_half_spaces(pairs, planes, along, everybody)
         self.clock.charge("update")
         return Program(condensed, pairs, planes, relaxation, qp, subproblem, rows)
@@ -282,7 +282,7 @@ class Transcription:
         condensed: Condensed,
         pairs: Pairs,
         planes: Planes,
-        relaxation: Relaxation = Relaxation.NOBODY,
+        relaxation: Relaxation = Relaxation.NONE,
         radius: FloatArray | None = None,
     ) -> CondensedQP:
         """The condensed values of a convex program; arguments as for `write`."""
@@ -295,10 +295,10 @@ class Transcription:
             lower[c.inputs] = np.maximum(lower[c.inputs], u - radius)
             upper[c.inputs] = np.minimum(upper[c.inputs], u + radius)
         l1_weight = None
-        if relaxation is not Relaxation.NOBODY:
+        if relaxation is not Relaxation.NONE:
             l1_weight = np.full(len(lower) + len(b), np.inf)
             l1_weight[c.relaxable] = self.problem.state_slack_weight
-            if relaxation is Relaxation.EVERYBODY:
+            if relaxation is Relaxation.ALL:
                 l1_weight[len(lower) :] = self.problem.slack_weight
         free = condensed.y_free[c.boxed]
         return CondensedQP(
@@ -321,7 +321,7 @@ class Transcription:
     def next_relaxation(self, relaxation: Relaxation, hard: bool) -> Relaxation | None:
         """Who is to give way next; None if nobody is left: hard obstacles never do."""
         more = [level for level in self._levels if level > relaxation]
-        if not more or (hard and more[0] is Relaxation.EVERYBODY):
+        if not more or (hard and more[0] is Relaxation.ALL):
             return None
         return more[0]
 

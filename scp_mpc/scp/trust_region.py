@@ -22,7 +22,7 @@ _CLOSE = 1e-2  # KKT residual from which on its fall counts, whatever the merit 
 _NOISE = 1e-12  # of the merit, relative
 
 
-class Region:
+class TrustRegion:
     """A trust region and its merit.
 
     Args:
@@ -56,7 +56,7 @@ class Region:
             return True
         largest = float(np.abs(solution.force[len(program.qp.F) :]).max(initial=0.0))
         self._weight = min(max(self._weight / 2, 2 * largest), at.problem.slack_weight)
-        if program.relaxation is Relaxation.EVERYBODY:
+        if program.relaxation is Relaxation.ALL:
             self._weight = at.problem.slack_weight
         before, after = self._merit(nominal), self._merit(trial)
         d = refinement.v - program.condensed.here

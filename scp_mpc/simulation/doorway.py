@@ -13,8 +13,8 @@ from scp_mpc.control.path_reference import PathReference
 from scp_mpc.control.speed import SpeedLimits
 from scp_mpc.geometry.margin import StageRisk
 from scp_mpc.models.unicycle import Unicycle
+from scp_mpc.obstacles.polytope import Polytope
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.obstacles.shape import Polytope
 from scp_mpc.problem import Problem
 from scp_mpc.settings import require_positive
 from scp_mpc.simulation.drive import Look

@@ -12,8 +12,8 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.path import Path
 from scp_mpc.control.path_reference import PathReference
 from scp_mpc.models.bicycle import KinematicBicycle
+from scp_mpc.obstacles.polytope import Polytope
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.obstacles.shape import Polytope
 from scp_mpc.problem import Problem
 from scp_mpc.simulation.drive import Look
 

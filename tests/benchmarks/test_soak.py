@@ -1,6 +1,7 @@
 """Twenty thousand steps of the soak, its resumption, and whether it would notice a fault."""
 
 import json
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,15 @@ def test_twenty_thousand_steps_and_their_resumption(tmp_path):
 def test_bad_soaks_are_refused(values, tmp_path):
     with pytest.raises(InvalidArgumentError, match=next(iter(values))):
         run_soak(tmp_path, **values)
+
+
+@pytest.fixture(autouse=True)
+def logger_as_before():
+    """A chunk silences the library in its process, which here is that of the other tests."""
+    logger = logging.getLogger("scp_mpc")
+    level = logger.level
+    yield
+    logger.setLevel(level)
 
 
 def test_nothing_missing_is_nothing_done(tmp_path, monkeypatch):

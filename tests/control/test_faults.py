@@ -2,7 +2,7 @@
 
 One check or small group for each; 8 to 14 are in `test_faults_over_time.py`. What a plan claims is
 judged by `judge.py`, which shares no code with the package. Any single step is in
-`test_steps_property.py`, any sequence of steps (check 12) in `test_machine.py`.
+`test_steps_property.py`, any sequence of steps (check 12) in `test_state_machine.py`.
 """
 
 import time

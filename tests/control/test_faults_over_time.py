@@ -149,7 +149,7 @@ def test_11_arguments_stay_as_they_are_and_may_come_in_any_form():
     assert before == [a.tobytes() for a in arrays]
 
 
-# 12. Mixed calls, a short one; any sequence of them is in test_machine.py
+# 12. Mixed calls, a short one; any sequence of them is in test_state_machine.py
 
 
 def test_12_bad_calls_among_good_ones_leave_no_trace():

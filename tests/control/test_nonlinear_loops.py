@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from instances import obstacle, problem, straight_reference
-from machines import MODELS, machine_problem, straight
+from nonlinear_cases import MODELS, machine_problem, straight
 
 from scp_mpc import (
     MPC,

@@ -8,7 +8,7 @@ import piqp
 import pytest
 from driving import N, drive
 from instances import S_REF, instance, obstacle, problem, straight_reference
-from machines import machine_problem, ride
+from nonlinear_cases import machine_problem, ride
 from scipy import sparse
 from solving import solution
 

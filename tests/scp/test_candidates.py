@@ -6,8 +6,8 @@ from instances import S_REF, obstacle, problem, rotated, straight_reference
 from solving import half_spaces
 
 from scp_mpc import SCP, DoubleIntegrator, ObstaclePrediction, Settings
-from scp_mpc.scp.candidates import MAX_CANDIDATES, Homotopy, candidates, same_homotopy
-from scp_mpc.scp.multi_start import Present
+from scp_mpc.scp.candidates import MAX_CANDIDATES, PassingPattern, candidate_paths, same_pattern
+from scp_mpc.scp.multi_start import Incumbent
 from scp_mpc.scp.step import Step
 
 N = 20
@@ -24,7 +24,7 @@ def ways(case, reference, obstacles, present=None):
     step = Step.read(case, reference[0], reference, obstacles)
     free = reference[1:, case.model.position]
     s = np.full(case.max_obstacles, S_REF)
-    return step, candidates(step, free, free if present is None else present, s)
+    return step, candidate_paths(step, free, free if present is None else present, s)
 
 
 def test_the_free_plans_own_time_passes_left_and_right():
@@ -125,12 +125,12 @@ def test_the_same_way_is_the_same_stages_on_the_same_side():
     case, ref = problem(N, "exact"), straight_reference(N)
     step, found = ways(case, ref, [obstacle(N, (3.0, 0.1), (0.5, 0.0))])
     touched = conflicts(step, ref[1:, [0, 2]], S)
-    left, right = (Homotopy(side.path, touched) for side in found if side.time == 0)
-    assert same_homotopy(step, left, left)
-    assert not same_homotopy(step, left, right)
+    left, right = (PassingPattern(side.path, touched) for side in found if side.time == 0)
+    assert same_pattern(step, left, left)
+    assert not same_pattern(step, left, right)
     fewer = touched.copy()
     fewer[0, np.flatnonzero(touched[0])[0]] = False
-    assert not same_homotopy(step, left, Homotopy(left.path, fewer))
+    assert not same_pattern(step, left, PassingPattern(left.path, fewer))
 
 
 def test_an_obstacle_met_head_on_is_left_on_the_side_the_robot_comes_from():
@@ -149,14 +149,14 @@ def test_rivals_begin_at_the_state_not_at_the_reference(monkeypatch):
     case, ref = problem(20), straight_reference(20)
     solver = SCP(case, Settings(max_candidates=3))
     x0, starts = ref[0] + [-0.3, 0.2, 0.2, 0.0], []
-    start_from = Present.start
+    start_from = Incumbent.start
 
     def noting(present, one):
         plan = start_from(present, one)
         starts.append(plan.rollout)
         return plan
 
-    monkeypatch.setattr(Present, "start", noting)
+    monkeypatch.setattr(Incumbent, "start", noting)
     solver.solve(x0, ref, [obstacle(20, (3.0, 0.1), (0.5, 0.0))])
     assert starts
     for start in starts:

@@ -1,4 +1,4 @@
-"""The certificate: the residual that CasADi's own derivatives relaxation, at plans good and bad."""
+"""The certificate: the residual that CasADi's own derivatives give, at plans good and bad."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,7 +9,7 @@ from driving import drive, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import KINDS, S_REF, instance, obstacle, problem, straight_reference
-from machines import machine_problem, straight
+from nonlinear_cases import machine_problem, straight
 from rebuilt import slopes
 from solving import half_spaces
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from instances import KINDS, S_REF, instance, obstacle, problem, straight_reference
-from machines import KINDS as RIDES
-from machines import ride
+from nonlinear_cases import KINDS as RIDES
+from nonlinear_cases import ride
 
 from scp_mpc import SCP, DoubleIntegrator, FunctionModel, LinearModel, Settings, Status, Trajectory
 from scp_mpc.scp.condensing import Condenser

@@ -9,8 +9,8 @@ import casadi
 import numpy as np
 import pytest
 from instances import KINDS, S_REF, instance
-from machines import DRAG, DT, MODELS, SIZE, ride
-from machines import KINDS as RIDES
+from nonlinear_cases import DRAG, DT, MODELS, SIZE, ride
+from nonlinear_cases import KINDS as RIDES
 from referee import Referee
 from referee_models import ModelReferee
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from machines import DT, machine_problem, ride, straight
+from nonlinear_cases import DT, machine_problem, ride, straight
 
 from scp_mpc import (
     MPC,
@@ -19,7 +19,7 @@ from scp_mpc import (
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.models import FunctionModel
 from scp_mpc.scp.nodes import LinearNodes
-from scp_mpc.scp.trust_region import Region
+from scp_mpc.scp.trust_region import TrustRegion
 from scp_mpc.trajectory import rollout
 
 N = 12
@@ -101,7 +101,7 @@ def test_a_function_that_is_linear_gives_the_linear_plan(seed, nodes_per_interva
 
 
 def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
-    verdicts, radii, inner = [], [], Region.accepts
+    verdicts, radii, inner = [], [], TrustRegion.accepts
 
     def watched(self, nominal, best, trial, *args):
         accepted = inner(self, nominal, best, trial, *args)
@@ -110,7 +110,7 @@ def test_the_trust_region_shrinks_grows_and_merit_falls(monkeypatch):
         radii.append(np.inf if self.radius is None else self.radius.max())
         return accepted
 
-    monkeypatch.setattr(Region, "accepts", watched)
+    monkeypatch.setattr(TrustRegion, "accepts", watched)
     problem = machine_problem("quadrotor", 20)
     x0, x_ref = np.zeros(9), straight(problem.model, 20)
     x0[[1, 8]] = -1.5, -2.8

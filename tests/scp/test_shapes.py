@@ -186,12 +186,12 @@ def certified(case, x0, x_ref, obstacles):
 HORIZON = 20
 REF = straight_reference(HORIZON)
 WALL = Polytope.box([0.4, 3.0])
-BENT = Polytope.box([0.8, 2.6], angle=0.3)
+CURVATURE_TOLERANCE = Polytope.box([0.8, 2.6], angle=0.3)
 TRIANGLE = Polytope([[-0.6, -0.5], [0.7, -0.3], [0.1, 0.8]])
 WORLDS = {
     "box": [Polytope.box([1.0, 0.8], angle=0.4).static(HORIZON, (4.0, 0.1))],
     "rounded": [TRIANGLE.static(HORIZON, (4.0, -0.2), radius=0.3)],
-    "slalom": [WALL.static(HORIZON, (2.5, -1.3)), BENT.static(HORIZON, (5.5, 1.3))],
+    "slalom": [WALL.static(HORIZON, (2.5, -1.3)), CURVATURE_TOLERANCE.static(HORIZON, (5.5, 1.3))],
     "door": [WALL.static(HORIZON, (4.0, -1.4)), WALL.static(HORIZON, (4.0, 2.4))],
 }
 

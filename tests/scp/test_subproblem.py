@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from instances import S_REF, instance, obstacle, problem, straight_reference
-from machines import MODELS, machine_problem, ride, straight
+from nonlinear_cases import MODELS, machine_problem, ride, straight
 from rebuilt import SLOTS, couplings_of, rebuilt
 from solving import solution
 

@@ -1,6 +1,6 @@
 """Write the tables of README and docs from the results, with the commit that they come from.
 
-    python benchmarks/fill.py
+    python benchmarks/fill_tables.py
 
 A table stands between `<!-- table: NAME -->` and `<!-- end -->`. A test fails where what stands
 there is not what the results say, where their commit is not an ancestor of this one, or where the

@@ -7,7 +7,7 @@ from instances import S_REF, problem
 
 from scp_mpc import ObstaclePrediction
 from scp_mpc.obstacles import Polytope
-from scp_mpc.scp.candidates import Homotopy, Walls, candidates, same_homotopy
+from scp_mpc.scp.candidates import PassingPattern, Walls, candidate_paths, same_pattern
 from scp_mpc.scp.step import Step
 
 N = 8
@@ -101,7 +101,7 @@ def test_flips_put_touching_stages_beyond_every_other_face(step):
 
 
 def test_candidates_pass_polytopes_on_both_sides_together_and_apart(step):
-    ways = candidates(step, PATH, PATH, np.full(2, S_REF), most=32)
+    ways = candidate_paths(step, PATH, PATH, np.full(2, S_REF), most=32)
     heights = [(way.path[3, 1], way.path[6, 1]) for way in ways]
     for first, second in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         assert any(a * first > 0.1 and b * second > 0.1 for a, b in heights)
@@ -117,7 +117,7 @@ def test_the_two_faces_of_a_long_wall_are_two_sides():
     step = Step.read(case, np.zeros(4), np.zeros(4), [wall])
     touched = np.ones((1, N), dtype=bool)
     left, right, up = (
-        Homotopy(np.tile(p, (N, 1)), touched) for p in ([1.7, 9.0], [2.3, 9.0], [1.7, -9.0])
+        PassingPattern(np.tile(p, (N, 1)), touched) for p in ([1.7, 9.0], [2.3, 9.0], [1.7, -9.0])
     )
-    assert not same_homotopy(step, left, right)
-    assert same_homotopy(step, left, up)
+    assert not same_pattern(step, left, right)
+    assert same_pattern(step, left, up)
