@@ -1,59 +1,59 @@
 """Where the time of one control step goes, and whether what comes next still fits in."""
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from heapq import nlargest
 from math import inf
 from time import perf_counter
 
-_WINDOW = 40  # measurements of a task that are remembered
-_SPIKE = 3.0  # times the next longest: one beyond that was a hiccup, if what followed it was not
-_LEAST = 1e-6  # [s] of any task
+_FORGET = 0.02  # of the difference to a shorter time, each time it is measured
 _EASE = 0.98  # of a time, each time that it stood in the way
+_SPIKE = 3.0  # times what was known: perhaps a hiccup of the machine
+_LEAST = 1e-6  # [s] of any task
 _PATIENCE = 3  # times that a task is not begun before it is tried all the same; then twice as many
 _MOST_PATIENCE = 48
 
 
 class Pace:
-    """How long tasks took lately, at the longest, but for a single hiccup that has passed.
+    """How long tasks took lately: their longest times, slowly forgotten.
 
     One serves all steps of a controller, so that the first iteration of a step is predicted from
-    those of earlier steps. A task that seems too long is tried again after a while, for nothing is
-    learnt about what is never begun; if it is still too long, after twice as long a while.
+    those of earlier steps. A sudden long time is forgotten at once if the next one is as before. A
+    task that seems too long is tried again after a while, for nothing is learnt about what is never
+    begun; if it still is too long, after twice as long a while.
     """
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
-        self._seconds: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_WINDOW))
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._before: dict[str, float] = {}  # what was known before a sudden long time
         self._waited: defaultdict[str, int] = defaultdict(int)
         self._patience: defaultdict[str, int] = defaultdict(lambda: _PATIENCE)
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
-        known = self._seconds[task]
-        longest = nlargest(2, known)
-        if len(longest) == 2 and longest[0] > _SPIKE * longest[1] and known[-1] < longest[0]:
-            return longest[1]
-        return longest[0] if longest else 0.0
+        return self._seconds[task]
 
     def learn(self, task: str, seconds: float) -> None:
         """Take note of a measured time."""
-        if self._waited[task] or self._patience[task] > _PATIENCE:  # it stood in the way
-            if seconds <= self.expected(task) / 2:
-                self._seconds[task].clear()
-                self._patience[task] = _PATIENCE
-            self._waited[task] = 0
-        self._seconds[task].append(seconds)
+        known, before = self._seconds[task], self._before.pop(task, None)
+        tried = self._waited[task] > 0 or self._patience[task] > _PATIENCE
+        self._waited[task] = 0
+        if tried and seconds <= known / 2:  # it stood in the way for nothing
+            self._seconds[task], self._patience[task] = seconds, _PATIENCE
+        elif before is not None and _SPIKE * seconds < known:
+            self._seconds[task] = max(before, seconds)
+        else:
+            if 0 < _SPIKE * known < seconds:
+                self._before[task] = known
+            self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
 
     def tries(self, task: str) -> bool:
         """Whether to begin a task that is expected to take too long, to see whether it does.
 
         Each time that it is not, a little less is expected: what is hardly too long is soon begun.
         """
-        most = _EASE * self.expected(task)
-        known = [min(seconds, most) for seconds in self._seconds[task]]
-        self._seconds[task] = deque(known, maxlen=_WINDOW)
+        self._seconds[task] *= _EASE
         self._waited[task] += 1
         if self._waited[task] <= self._patience[task]:
             return False
