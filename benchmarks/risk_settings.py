@@ -20,7 +20,7 @@ from scipy.stats import chi2, norm
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.geometry.margin import Containment, JointRisk, Margin, Promise, StageRisk
+from scp_mpc.geometry.margin import Containment, JointRisk, Margin, MarginSpec, StageRisk
 from scp_mpc.models.linear import LinearModel
 from scp_mpc.problem import Problem
 from scp_mpc.settings import require_positive
@@ -121,7 +121,7 @@ def problem_for(
     return Problem(model, **(values | given))
 
 
-def _promise(setting: RiskSetting, shares: int, dim: int) -> Promise:
+def _promise(setting: RiskSetting, shares: int, dim: int) -> MarginSpec:
     if setting.scale != 1:
         return Margin.fixed(setting.scale * _size(setting, shares, dim))
     if setting.kind == "report":

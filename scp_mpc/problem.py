@@ -12,10 +12,10 @@
 
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Inputs are weighed
 from the model's `equilibrium_input`, which is zero but for robots that hover. Bounds of states
-and of rates are there where they are given. Those of states give way at an exact price: where they
-can be kept, they are, and the excess e is reported where they cannot, as after a start outside
-them. Those of inputs and rates never give way; for there always to be such inputs, holding an input
-must be allowed: du_min <= 0 <= du_max.
+and of rates are there where they are given. Those of states are softened by an exact L1 penalty:
+where they can be kept, they are, and the excess e is reported where they cannot, as after a start
+outside them. Those of inputs and rates are hard; for there always to be such inputs, holding an
+input must be allowed: du_min <= 0 <= du_max.
 
 Notation:
     e (N, nx)   excess of the states over their bounds: max(0, x - x_max, x_min - x)
@@ -42,7 +42,7 @@ from scp_mpc.arrays import (
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation, Inflation
-from scp_mpc.geometry.margin import Containment, Margin, Promise, size_at
+from scp_mpc.geometry.margin import Containment, Margin, MarginSpec, size_at
 from scp_mpc.models.model import Model
 from scp_mpc.models.riccati import terminal_weight
 from scp_mpc.settings import require_positive
@@ -100,7 +100,7 @@ class Problem:
     u_max: FloatArray
     Qf: FloatArray
     robot_radius: float
-    margin: Promise
+    margin: MarginSpec
     inflation: Literal["exact", "axes"]
     max_obstacles: int
     nodes_per_interval: int
@@ -123,7 +123,7 @@ class Problem:
         u_max: ArrayLike,
         Qf: ArrayLike | Literal["lqr"] | None = None,
         robot_radius: float = 0.0,
-        margin: Promise | None = None,
+        margin: MarginSpec | None = None,
         inflation: Literal["exact", "axes"] = "exact",
         max_obstacles: int = 1,
         nodes_per_interval: int = 4,
@@ -155,7 +155,7 @@ class Problem:
         nodes_per_interval = as_count("nodes_per_interval", nodes_per_interval)
         if margin is None:
             margin = Margin() if model.dim == 2 else Containment(0.95)
-        if not isinstance(margin, Promise):
+        if not isinstance(margin, MarginSpec):
             raise InvalidArgumentError("margin", f"{margin!r} is no Margin, risk or Containment")
         weights = as_weight("Q", Q, model.nx), as_weight("R", R, model.nu)
         if isinstance(Qf, str) and Qf == "lqr":

@@ -2,7 +2,7 @@
 
 from scp_mpc.geometry.ellipsoid import signed_distance
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation, Inflation
-from scp_mpc.geometry.margin import Containment, JointRisk, Margin, Promise, StageRisk
+from scp_mpc.geometry.margin import Containment, JointRisk, Margin, MarginSpec, StageRisk
 from scp_mpc.geometry.no_go import HalfSpaces, NoGoSets
 from scp_mpc.geometry.risk import containment_size, risk_bound, size_at_risk
 
@@ -14,8 +14,8 @@ __all__ = [
     "Inflation",
     "JointRisk",
     "Margin",
+    "MarginSpec",
     "NoGoSets",
-    "Promise",
     "StageRisk",
     "containment_size",
     "risk_bound",

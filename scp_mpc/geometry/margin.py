@@ -2,7 +2,7 @@
 
 Notation:
     J       number of obstacles         N       number of stages (intervals)
-    K       points in each interval at which an obstacle is constrained
+    K       nodes in each interval at which an obstacle is constrained
     delta   risk; Phi, the standard normal distribution function
 """
 
@@ -79,8 +79,8 @@ class Containment:
 class StageRisk:
     """P(the robot touches obstacle j during (t_{i-1}, t_i]) <= delta, for each j and i.
 
-    s = Phi^-1(1 - delta / (K + 1)): the points of an interval, its beginning included, share the
-    risk equally (Boole), for touching anywhere between two points takes one of them too near. With
+    s = Phi^-1(1 - delta / (K + 1)): the nodes of an interval, its beginning included, share the
+    risk equally (Boole), for touching anywhere between two nodes takes one of them too near. With
     the samples alone it is P(the robot touches obstacle j at t_i), and s = Phi^-1(1 - delta).
 
     Attributes:
@@ -93,9 +93,9 @@ class StageRisk:
         """Check the risk."""
         _require_risk("delta", self.delta)
 
-    def size(self, points: int) -> float:
-        """The size s where that many points share the risk of an interval."""
-        return float(size_at_risk(self.delta / points))
+    def size(self, nodes: int) -> float:
+        """The size s where that many nodes share the risk of an interval."""
+        return float(size_at_risk(self.delta / nodes))
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class JointRisk:
 
     Attributes:
         delta: Largest risk of the whole plan, between 0 and 1/2.
-        allocation: "uniform": each of the J N K points gets the same share (Boole). "iterative":
+        allocation: "uniform": each of the J N K nodes gets the same share (Boole). "iterative":
             what a point does not use goes to those that hold the plan up (iterative risk
             allocation: Ono and Williams, 2008); never costs more than the uniform one.
     """
@@ -120,16 +120,16 @@ class JointRisk:
                 "allocation", f"{self.allocation!r} is neither 'uniform' nor 'iterative'"
             )
 
-    def size(self, points: int) -> float:
-        """The size s where all obstacles together have that many points."""
-        return float(size_at_risk(self.delta / max(points, 1)))
+    def size(self, nodes: int) -> float:
+        """The size s where all obstacles together have that many nodes."""
+        return float(size_at_risk(self.delta / max(nodes, 1)))
 
 
-Promise = Margin | Containment | StageRisk | JointRisk
+MarginSpec = Margin | Containment | StageRisk | JointRisk
 
 
 def size_at(
-    promise: Promise, dim: int, obstacles: int, stages: int, count: int, gaps: int
+    promise: MarginSpec, dim: int, obstacles: int, stages: int, count: int, gaps: int
 ) -> float:
     """The uniform size s of a promise.
 
@@ -140,7 +140,7 @@ def size_at(
         stages: N.
         count: K.
         gaps: Points at the beginning of an interval, if the promise covers what happens between
-            two points; else 0.
+            two nodes; else 0.
     """
     if isinstance(promise, Margin):
         return promise.reference

@@ -190,7 +190,7 @@ class Certificate:
 
 
 def least_curvature(
-    W: FloatArray | None, bends: FloatArray, rows: FloatArray, force: FloatArray
+    W: FloatArray | None, factors: FloatArray, rows: FloatArray, force: FloatArray
 ) -> tuple[float, FloatArray]:
     """Smallest curvature of I + W - L'L that the active constraints leave, over its largest.
 
@@ -201,7 +201,7 @@ def least_curvature(
 
     Args:
         W: (nv, nv) as above; None for zero.
-        bends: (q, nv) L.
+        factors: (q, nv) L.
         rows: (k, nv) gradients of the active constraints, towards where they allow to go.
         force: (k,) their forces, non-negative.
 
@@ -209,20 +209,20 @@ def least_curvature(
         The smallest eigenvalue over the largest, and its direction (nv,).
     """
     weak = force <= _STRONG * max(1.0, float(force.max(initial=0.0)))
-    least, direction = _smallest(W, bends, rows[~weak])
+    least, direction = _smallest(W, factors, rows[~weak])
     if least >= -CURVATURE_TOLERANCE or not weak.any():
         return least, direction
     along = rows[weak] @ direction
     if (along >= -_TOUCH).all() or (along <= _TOUCH).all():
         return least, direction if (along >= -_TOUCH).all() else -direction
-    return _smallest(W, bends, rows)
+    return _smallest(W, factors, rows)
 
 
 def _smallest(
-    W: FloatArray | None, bends: FloatArray, rows: FloatArray
+    W: FloatArray | None, factors: FloatArray, rows: FloatArray
 ) -> tuple[float, FloatArray]:
     """Smallest eigenvalue on the null space of some rows, over the largest, and its direction."""
-    nv = bends.shape[1]
+    nv = factors.shape[1]
     basis = None
     if len(rows):  # orthonormal rows that span theirs
         sizes, vectors = np.linalg.eigh(rows @ rows.T)
@@ -231,12 +231,12 @@ def _smallest(
         if basis.shape[1] == nv:  # nothing is left to move in
             return 1.0, np.zeros(nv)
     if W is None:  # the eigenvalues of I - L'L on a subspace are those of a matrix as small as L
-        inner = bends if basis is None else bends - (bends @ basis) @ basis.T
+        inner = factors if basis is None else factors - (factors @ basis) @ basis.T
         values, vectors = np.linalg.eigh(inner @ inner.T)
         if not len(values):
             return 1.0, np.zeros(nv)
         return float(1.0 - values[-1]) / max(1.0, float(values[-1]) - 1.0), vectors[:, -1] @ inner
-    M = W - bends.T @ bends
+    M = W - factors.T @ factors
     M.flat[:: nv + 1] += 1.0
     if basis is not None:
         across = basis.T @ M

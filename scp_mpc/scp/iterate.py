@@ -89,7 +89,7 @@ class Iterate:
 
     @property
     def touched(self) -> BoolArray:
-        """Which obstacles push this point, at which points: (M, C)."""
+        """Which obstacles push this point, at which nodes: (M, C)."""
         duals = self.multipliers
         if duals is None:
             return np.zeros(self.slack.shape, dtype=np.bool_)

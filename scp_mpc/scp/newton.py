@@ -20,7 +20,7 @@ and Newton's step goes on from the convex one within the null space of A: P (I +
 Notation:
     d   (nv,)       step of the condensed problem
     A   (k, nv)     responses of the active constraints
-    L   (q, nv)     responses of the bends, each times the root of its force
+    L   (q, nv)     responses of the curvature factors, each times the root of its force
     W   (nv, nv)    what the convex program leaves out; -L'L for a linear robot
 """
 
@@ -42,12 +42,12 @@ def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolu
     """Go on from a convex step to Newton's, if its active set carries that far."""
     condensed, nf = program.condensed, len(program.qp.F)
     if at.linear:
-        bends, push, L = at.curvature_factors(program, solution.force[nf:])
+        factors, push, L = at.curvature_factors(program, solution.force[nf:])
         if not len(push):
             return solution
         moved = condensed.y(solution.v) - program.planes.y
         turned = np.einsum("kwm,kw->km", L, moved[program.pairs.at[push]])
-        whole = summed(solution, bends, turned.ravel())
+        whole = summed(solution, factors, turned.ravel())
     else:
         W = at.curvature(program, solution)
         whole = newton_step(solution, solution.v - condensed.here, W)
@@ -72,18 +72,18 @@ def second_order_correction(program: Program, solution: QPSolution, trial: Nomin
     return replace(solution, v=solution.v + change)
 
 
-def summed(solution: QPSolution, bends: FloatArray, step: FloatArray) -> QPSolution | None:
+def summed(solution: QPSolution, factors: FloatArray, step: FloatArray) -> QPSolution | None:
     """Return the solution that the convex steps from this one on tend to; None if they do not.
 
     Args:
         solution: Of the convex subproblem.
-        bends: (q, nv) L, as above.
-        step: (q,) L d: the convex step as the bends see it.
+        factors: (q, nv) L, as above.
+        step: (q,) L d: the convex step as the curvature factors see it.
     """
-    bent = np.eye(len(bends)) - bends @ bends.T
-    within = np.zeros((0, len(bends)))
+    bent = np.eye(len(factors)) - factors @ factors.T
+    within = np.zeros((0, len(factors)))
     if len(solution.indices):
-        across = solution.rows @ bends.T
+        across = solution.rows @ factors.T
         within, _ = dpotrs(solution.factor, across)
         bent += across.T @ within
     _, turn, info = dposv(bent, step)
@@ -92,7 +92,7 @@ def summed(solution: QPSolution, bends: FloatArray, step: FloatArray) -> QPSolut
     change = within @ turn
     force = solution.force.copy()
     force[solution.indices] -= change
-    v = solution.v + turn @ bends - change @ solution.rows
+    v = solution.v + turn @ factors - change @ solution.rows
     return replace(solution, v=v, force=force)
 
 

@@ -3,7 +3,7 @@
 Plan, give risk to those who need it, plan again.
 
 Notation:
-    delta   (J, C)  risk allocated to obstacle j at point c; their sum is the joint risk
+    delta   (J, C)  risk allocated to obstacle j at node c; their sum is the joint risk
     used    (J, C)  risk bound of the plan that was found with it
 """
 

@@ -274,12 +274,12 @@ class SCP:
                     np.tile(self.problem.model.equilibrium_input, (self.problem.horizon, 1))
                 )
             elif at.linear:
-                start = at.at(known or last, at.nobody.near)
+                start = at.at(known or last, at.no_pairs.near)
             else:
-                start = at.at(last, at.nobody.near)
+                start = at.at(last, at.no_pairs.near)
                 limit = 1 if last.touches else None
                 if last.obstacle_free is not None and not last.touches:
-                    other = at.at(last.obstacle_free, at.nobody.near)
+                    other = at.at(last.obstacle_free, at.no_pairs.near)
                     merits = [at.merit(p.cost, 0.0, p.excess) for p in (start, other)]
                     start = other if merits[1] < merits[0] else start
             found = None

@@ -38,7 +38,7 @@ class Step:
         obstacles: The J predictions.
         nodes: Where the plan is constrained.
         means: (J, C+1, d) expected positions, row 0 now [m].
-        radii: (J, C) sums of the radii, or more where gaps between points ask for it [m].
+        radii: (J, C) sums of the radii, or more where gaps between nodes ask for it [m].
         robot_covariance: (N+1, d, d) of the robot's own position [m^2], or None.
         scale: (J, C) what multiplies the standard deviations: sizes over s_ref; or None for one.
         u_last: (nu,) input last applied, from which the first rate counts; None for unknown.
@@ -187,7 +187,7 @@ class Step:
         return wide
 
     def scaled(self, sizes: FloatArray) -> "Step":
-        """The same with sizes (J, C) of their own at all points."""
+        """The same with sizes (J, C) of their own at all nodes."""
         return replace(self, scale=sizes / self.problem.size.reference)
 
     def within(

@@ -74,12 +74,12 @@ class Transcription:
     Attributes:
         linear: Whether the robot is linear.
         step: The control step, with radii and sizes as they count just now.
-        nobody: No pairs at all.
+        no_pairs: No pairs at all.
         obstacle_free: The plan that ignores the obstacles, where another one was found.
     """
 
     step: Step
-    nobody: Pairs
+    no_pairs: Pairs
     obstacle_free: Iterate | None
 
     def __init__(self, problem: Problem, settings: Settings, nodes: Nodes) -> None:
@@ -102,7 +102,7 @@ class Transcription:
         self.step, self.clock, self.obstacle_free = step, clock, None
         self.condenser.begin(step)
         self.bounds = self.layout.bounds(step)
-        self.nobody = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
+        self.no_pairs = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
         for subproblem in (self.hard, self.elastic):
             subproblem.solver.finished, subproblem.about = Counter(), None
 
@@ -143,7 +143,7 @@ class Transcription:
         """A plan of inputs (N, nu) on which nothing pushes, obstacles left out."""
         y, rollout = self.rolled(inputs, self._full, guess)
         nothing = np.zeros(self.layout.size - self.layout.boxed.start)
-        return self.nominal(y, rollout, nothing, self.nobody, np.zeros(0))
+        return self.nominal(y, rollout, nothing, self.no_pairs, np.zeros(0))
 
     def at(
         self, iterate: Iterate, near: BoolArray | None = None, about: FloatArray | None = None
@@ -182,8 +182,8 @@ class Transcription:
         if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
             self.hard.solver.finished["kkt"] += 1
             return self.plain(free[self.layout.u].reshape(rest.shape))
-        planes = self.nobody.planes(free)
-        qp = self.condensed_qp(condensed, self.nobody, planes)
+        planes = self.no_pairs.planes(free)
+        qp = self.condensed_qp(condensed, self.no_pairs, planes)
         active = np.zeros(len(qp.F), dtype=np.intp)
         if guess is not None and guess.multipliers is not None:
             active[:] = -np.sign(self._reaction(guess.multipliers))
@@ -194,7 +194,7 @@ class Transcription:
         if end.solution is None:
             return None
         self.hard.solver.finished["kkt"] += 1
-        given = condensed, self.nobody, planes, Relaxation.NONE, qp, self.hard
+        given = condensed, self.no_pairs, planes, Relaxation.NONE, qp, self.hard
         return self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
 
     def outputs(self, iterate: Iterate) -> FloatArray:
@@ -357,14 +357,14 @@ class Transcription:
         push = (force > NEGLIGIBLE).nonzero()[0]
         L = pairs.curvature_factor(planes)[push] * np.sqrt(force[push])[:, None, None]
         rows = pairs.rows(program.condensed.by.S)[push]
-        bends = np.einsum("kwm,kwn->kmn", L, rows)
-        return bends.reshape(-1, bends.shape[-1]), push, L
+        factors = np.einsum("kwm,kwn->kmn", L, rows)
+        return factors.reshape(-1, factors.shape[-1]), push, L
 
     def curvature(self, program: Program, solution: QPSolution) -> FloatArray:
         """W (nv, nv): what the convex program leaves out of the Lagrangian's second derivative."""
-        bends = self.curvature_factors(program, solution.force[len(program.qp.F) :])[0]
+        factors = self.curvature_factors(program, solution.force[len(program.qp.F) :])[0]
         W = self._dynamics_curvature(program, solution)
-        return -bends.T @ bends if W is None else W - bends.T @ bends
+        return -factors.T @ factors if W is None else W - factors.T @ factors
 
     def _dynamics_curvature(self, program: Program, solution: QPSolution) -> FloatArray | None:
         """The part (nv, nv) of dynamics and positions; None of a linear robot."""
@@ -395,8 +395,8 @@ class Transcription:
         """
         qp, by, nf = program.qp, program.condensed.by, len(program.qp.F)
         W = self._dynamics_curvature(program, solution)
-        bends = self.curvature_factors(program, solution.force[nf:])[0]
-        if W is None and not len(bends):  # nothing but the convex program
+        factors = self.curvature_factors(program, solution.force[nf:])[0]
+        if W is None and not len(factors):  # nothing but the convex program
             residuals = replace(plan.residuals, curvature=1.0)
             return replace(plan, residuals=residuals), np.zeros(self.layout.shape)
         depth, side = qp.violations(solution.v)
@@ -404,7 +404,7 @@ class Transcription:
         indices = np.concatenate([solution.indices, touched.nonzero()[0]])
         towards = -np.where(touched, side, solution.active)[indices]  # where they allow to go
         rows, force = qp.rows[indices] * towards[:, None], np.abs(solution.force[indices])
-        least, direction = least_curvature(W, bends, rows, force)
+        least, direction = least_curvature(W, factors, rows, force)
         inputs = by.inverse.T @ direction[: len(by.inverse)]
         residuals = replace(plan.residuals, curvature=least)
         return replace(plan, residuals=residuals), inputs.reshape(self.layout.shape)

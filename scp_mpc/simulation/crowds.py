@@ -7,7 +7,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
-from scp_mpc.geometry.margin import Promise
+from scp_mpc.geometry.margin import MarginSpec
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -52,7 +52,7 @@ class Crowd:
     def problem(
         self,
         inflation: Literal["exact", "axes"] = "exact",
-        margin: Promise | None = None,
+        margin: MarginSpec | None = None,
         nodes_per_interval: int = 1,
     ) -> Problem:
         """The report's problem with room for all obstacles."""

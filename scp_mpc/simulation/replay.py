@@ -13,7 +13,7 @@ import numpy as np
 from scp_mpc.arrays import FloatArray, as_count
 from scp_mpc.control.mpc import MPC
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.geometry.margin import Containment, Promise
+from scp_mpc.geometry.margin import Containment, MarginSpec
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
@@ -109,7 +109,7 @@ class Replay:
 
 
 def replay_problem(
-    horizon: int = 15, margin: Promise | None = None, max_obstacles: int = 20
+    horizon: int = 15, margin: MarginSpec | None = None, max_obstacles: int = 20
 ) -> Problem:
     """A robot of 0.3 m at a walking pace, 95 % containment at each sample.
 

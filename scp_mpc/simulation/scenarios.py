@@ -7,7 +7,7 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
-from scp_mpc.geometry.margin import Promise
+from scp_mpc.geometry.margin import MarginSpec
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -44,7 +44,7 @@ class Scenario:
     def problem(
         self,
         inflation: Literal["exact", "axes"] = "axes",
-        margin: Promise | None = None,
+        margin: MarginSpec | None = None,
         nodes_per_interval: int = 1,
     ) -> Problem:
         """The report's problem (III.A, III.E), with s_min = s_ref and samples only, as printed."""

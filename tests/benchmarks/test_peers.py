@@ -186,10 +186,10 @@ class TestViolation:
         X = rollout(problem.model.step, x0, U).states
         bent = X.copy()
         bent[3, 1] += 0.01
-        nobody = np.zeros(0)
-        assert largest_violation(problem, x0, [], X, U, nobody) == 0
-        assert largest_violation(problem, x0, [], bent, U, nobody) == pytest.approx(0.01)
-        assert largest_violation(problem, x0 + 0.3, [], X, U, nobody) == pytest.approx(0.3)
+        no_pairs = np.zeros(0)
+        assert largest_violation(problem, x0, [], X, U, no_pairs) == 0
+        assert largest_violation(problem, x0, [], bent, U, no_pairs) == pytest.approx(0.01)
+        assert largest_violation(problem, x0 + 0.3, [], X, U, no_pairs) == pytest.approx(0.3)
 
     @pytest.mark.parametrize("sign", [1, -1])
     def test_input_bound(self, sign):

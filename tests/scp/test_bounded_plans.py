@@ -76,7 +76,7 @@ def test_excess_is_slack_where_it_is_paid_for_and_a_violation_where_not():
     for share, violation in ((1.0, 0.0), (0.5, excess.max())):
         layout, empty = at.layout, np.zeros((0, 0))
         reaction = layout.gathered(np.zeros(1), np.zeros((N, 2)), empty, share * force)
-        paid = at.nominal(plain.y, plain.rollout, reaction, at.nobody, np.zeros(0))
+        paid = at.nominal(plain.y, plain.rollout, reaction, at.no_pairs, np.zeros(0))
         np.testing.assert_allclose(paid.excess, excess[:, 1:].ravel(), atol=1e-12)
         assert paid.residuals.feasibility == pytest.approx(violation, abs=1e-12)
         price = at.merit(paid.cost, 0.0, paid.excess) - paid.cost

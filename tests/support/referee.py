@@ -27,7 +27,7 @@ class Verdict:
 
 
 class Referee:
-    """The firm problem with one planar obstacle, over w = [X_1..N | U | s | theta]."""
+    """The hard problem with one planar obstacle, over w = [X_1..N | U | s | theta]."""
 
     def __init__(self, problem: Problem, x0, x_ref, obstacle: ObstaclePrediction) -> None:
         self.problem, self.obstacle = problem, obstacle

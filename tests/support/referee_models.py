@@ -46,7 +46,7 @@ def symbolic(model) -> Callable:
 
 
 class ModelReferee:
-    """The firm problem over w = [X_1..N | U | n], with any number of obstacles.
+    """The hard problem over w = [X_1..N | U | n], with any number of obstacles.
 
     Args:
         problem: model, horizon, Q, R, Qf, u_min, u_max, robot_radius are read, and
