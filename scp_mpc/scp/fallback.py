@@ -29,11 +29,19 @@ class Fallback:
     def __init__(self, problem: Problem, tolerance: float) -> None:
         """Remember both."""
         self._problem, self._tolerance = problem, tolerance
+        self._rest = np.clip(problem.model.equilibrium_input, problem.u_min, problem.u_max)
 
     def best(self, step: Step, last: Iterate | None) -> Result:
-        """The last plan, if it meets every constraint; else braking, whether it does or not."""
-        kept = None if last is None else self.keep(step, last.inputs)
-        return kept if kept is not None and kept.status.ok else self.brake(step)
+        """The last plan, if it meets every constraint; else braking, whether it does or not.
+
+        Its last input is held one interval longer; or the robot brakes there.
+        """
+        if last is not None:
+            for inputs in (last.inputs, self._braked(step, last.inputs)):
+                kept = self.keep(step, inputs)
+                if kept.status.ok:
+                    return kept
+        return self.brake(step)
 
     def lesser(self, found: Result, braking: Result) -> Result:
         """Of two plans with a violation, a certified one, else the one with less.
@@ -57,22 +65,35 @@ class Fallback:
     def brake(self, step: Step, status: Status = Status.BRAKING) -> Result:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
         problem, model, x = self._problem, self._problem.model, step.x0
-        rest = np.clip(model.equilibrium_input, problem.u_min, problem.u_max)
-        most, least = problem.u_max - rest, problem.u_min - rest
-        U, last = np.tile(rest, (problem.horizon, 1)), step.u_last
+        U, last = np.tile(self._rest, (problem.horizon, 1)), step.u_last
         for u in U:
-            wanted = model.stopping_input(x) - rest
-            if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
+            stop = self._stop(x)
+            if stop is None:
                 break
-            # As far as the bounds allow in the direction of what is wanted; inputs without any
-            # room stay where they are.
-            room = np.where(wanted > 0, most, least)
-            none = np.abs(room) <= _AT_REST
-            wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
-            u += wanted / max(1.0, float((wanted / room).max()))
-            u[:] = last = problem.limited(u[None], last)[0]
+            u[:] = last = problem.limited(stop[None], last)[0]
             x = model.step(x, u)
         return self._judged(step, problem.limited(U, step.u_last), status)
+
+    def _stop(self, x: FloatArray) -> FloatArray | None:
+        """The input (nu,) that stops the robot, as far as the bounds allow; None at rest."""
+        problem, rest = self._problem, self._rest
+        wanted = problem.model.stopping_input(x) - rest
+        if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
+            return None
+        # In the direction of what is wanted; inputs without any room stay where they are.
+        room = np.where(wanted > 0, problem.u_max - rest, problem.u_min - rest)
+        none = np.abs(room) <= _AT_REST
+        wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
+        stop: FloatArray = rest + wanted / max(1.0, float((wanted / room).max()))
+        return stop
+
+    def _braked(self, step: Step, inputs: FloatArray) -> FloatArray:
+        """Inputs (N, nu), the last one instead of which brakes."""
+        x = step.x0
+        for u in inputs[:-1]:
+            x = self._problem.model.step(x, u)
+        stop = self._stop(x)
+        return np.concatenate([inputs[:-1], (self._rest if stop is None else stop)[None]])
 
     def _judged(self, step: Step, inputs: FloatArray, status: Status) -> Result:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
@@ -87,6 +108,9 @@ class Fallback:
             status = Status.FALLBACK if status.ok else status
         s = np.full(problem.max_obstacles, problem.size.reference)
         s[: step.count] = problem.size.lower  # all that a plan without a search can promise
+        if step.count and step.nodes.instants > 1:  # between them it is judged by its own motion
+            motion = step.nodes.motion(states, inputs)
+            step = step.widened(step.nodes.radii(step.radii, step.drift, motion))
         slack = np.zeros((problem.max_obstacles, step.nodes.size))
         slack[: step.count] = step.depths(step.nodes.positions(states, inputs), s)
         most = float(np.maximum(slack.max(initial=0.0), problem.excess(states).max()))  # or NaN

@@ -238,13 +238,13 @@ class SCP:
             best = None
             if step.count and clock.allows("iteration"):
                 best = self._loop.run(at.at(start, about=about), about=about)
-            found = Found(best or self._fallback.best(wide, last))
+            found = Found(best or self._fallback.best(step, last))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
             if isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
             ending = clock.elapsed()
-            best = self._rescued(wide, last, found.best)
+            best = self._rescued(step, last, found.best)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
                 best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))
             found = replace(found, best=best)
@@ -252,8 +252,10 @@ class SCP:
                 break
             start, about = found.best.iterate, None
         else:
-            found = replace(found, best=self._exposed(step, found.best))
-        plan = self._plan(wide, found, clock)
+            known = self._fallback.best(step, last)
+            best = known if known.status.ok else self._exposed(step, found.best)
+            found = replace(found, best=best)
+        plan = self._plan(at.step, found, clock)
         clock.learn("ending", ending)
         return plan
 
@@ -289,14 +291,21 @@ class SCP:
         return plan
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result) -> Result:
-        """Without a plan that meets every constraint: go on from one that does, if known."""
+        """Without a plan that meets every constraint: go on from one that does, if known.
+
+        What is known is judged by its own motion between the nodes, and so is what it leads to.
+        """
         if best.status.ok or best.status is Status.FALLBACK:
             return best
         known = self._fallback.best(step, last)
         if not known.status.ok:
             return self._fallback.lesser(best, known)
+        own = self._motion(known.iterate)
+        self._at.step = self._widened(step, own) if self._between else step
         better = self._loop.run(self._at.at(known.iterate))
-        return better if better and better.status.ok else known
+        if better is None or not better.status.ok:
+            return known
+        return better if not self._between or self._is_kept(step, own, better) else known
 
     def _is_clear(self, step: Step, plan: Nominal) -> bool:
         path, s = self._at.path(plan.y), plan.y[self._at.layout.s]
