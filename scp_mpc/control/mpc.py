@@ -3,6 +3,7 @@
 what is known of the obstacles now: reports brought up to the present, vanished ones kept
 nominal = previous plan, shifted
 plan = SCP (or braking, where a report is too old)
+backup = the plan, then braking to rest beyond its horizon; the last one, where this has none
 u0 within its bounds and a rate's reach, checked last; only then is anything remembered
 """
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, as_array, frozen
+from scp_mpc.control.backup import Backup
 from scp_mpc.control.memory import ObstacleMemory, Recall
 from scp_mpc.deadline import Clock
 from scp_mpc.errors import ConcurrentUseError
@@ -47,6 +49,7 @@ class MPC:
         self._memory = ObstacleMemory(
             self.settings.staleness, problem.model.dt, problem.max_obstacles
         )
+        self._backups = Backup(self.problem, self.settings.tolerance)
         self._busy = Lock()
         self._counts: Counter[Status] = Counter()
         self._forget()
@@ -54,6 +57,7 @@ class MPC:
     def _forget(self) -> None:
         self._last: Iterate | None = None
         self._applied: FloatArray | None = None
+        self._backup: FloatArray | None = None
         self._steps_touching = 0
         self._obstacles: tuple[ObstaclePrediction, ...] = ()
         self._counts.clear()
@@ -124,11 +128,17 @@ class MPC:
             if u_last is not None:
                 last = as_array("u_last", u_last, (self.problem.model.nu,))
             plan = self._plan(x0, x_ref, recall, robot_covariance, clock, last)
+            backup = None
+            if recall.stale is None and recall.obstacles and clock.allows("backup"):
+                with clock.task("backup"):
+                    given = x0, x_ref, recall.obstacles, robot_covariance, last
+                    plan, backup = self._backed(plan, *given)
             sound = self._within(plan, last)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref, last)
             self._memory.commit(recall)
             self._keep(plan, recall, plan.iterate if sound else None)
+            self._backup = backup if sound else None
             return plan
         finally:
             self._busy.release()
@@ -172,6 +182,33 @@ class MPC:
         Step.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
         _log.warning("%s: braking", recall.stale)
         return self._solver.brake(x0, x_ref, Status.STALE, last)
+
+    def _backed(
+        self,
+        plan: Plan,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: tuple[ObstaclePrediction, ...],
+        robot_covariance: ArrayLike | None,
+        last: FloatArray | None,
+    ) -> tuple[Plan, FloatArray | None]:
+        """A plan and its backup; or that of an earlier plan, where it is clear and this is not."""
+        backup = self._backups.of(plan.X, plan.U, obstacles) if plan.status.ok else None
+        if backup is not None or self._backup is None:
+            return plan, backup
+        model, N, states = self.problem.model, self.problem.horizon, [plan.X[0]]
+        for u in self._backup:
+            states.append(model.step(states[-1], u))
+        stop, path = self._backups.stopping(states[-1])
+        rest = np.tile(model.equilibrium_input, (N, 1))
+        inputs = np.concatenate([self._backup, stop, rest])[:N]
+        other = self._solver.follow(x0, x_ref, obstacles, inputs, robot_covariance, last)
+        stage = len(self._backup)
+        if not (other.status.ok and self._backups.is_clear(path, stop, obstacles, stage)):
+            return plan, None
+        free = plan.iterate.obstacle_free or plan.iterate
+        other = replace(other, iterate=replace(other.iterate, obstacle_free=free))
+        return replace(other, qps=plan.qps, timing=plan.timing), self._backup[1:]
 
     def _within(self, plan: Plan, last: FloatArray | None) -> bool:
         lower, upper = self.problem.u_min, self.problem.u_max

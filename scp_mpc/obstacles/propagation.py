@@ -52,7 +52,7 @@ def propagated(
     w, f = divmod(age / dt, 1.0)
     first = int(min(w, N))
     after = (w + f - N) + np.arange(N - first, N + 1)[:, None]
-    D = _positive_part(Sigma[N] - Sigma[N - 1])
+    D = positive_part(Sigma[N] - Sigma[N - 1])
     means = np.concatenate(
         [
             mu[first:N] + f * (mu[first + 1 :] - mu[first:N]),
@@ -71,7 +71,7 @@ def propagated(
     return prediction.with_rows(means, covariances, stamp)
 
 
-def _positive_part(matrix: FloatArray) -> FloatArray:
+def positive_part(matrix: FloatArray) -> FloatArray:
     """The nearest positive semi-definite matrix to a symmetric one: itself if it is one."""
     values, vectors = np.linalg.eigh(matrix)
     if values[0] >= 0:

@@ -64,15 +64,28 @@ class Fallback:
 
     def brake(self, step: Step, status: Status = Status.BRAKING) -> Result:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
-        problem, model, x = self._problem, self._problem.model, step.x0
-        U, last = np.tile(self._rest, (problem.horizon, 1)), step.u_last
-        for u in U:
-            stop = self._stop(x)
+        problem = self._problem
+        U, stop = np.tile(self._rest, (problem.horizon, 1)), self.stopping(step.x0, step.u_last)[0]
+        U[: len(stop)] = stop
+        return self._judged(step, problem.limited(U, step.u_last), status)
+
+    def stopping(
+        self, x: FloatArray, last: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Inputs (k, nu) that bring the robot to rest from x, k <= N, and states (k+1, nx)."""
+        problem, inputs, states = self._problem, [], [x]
+        for _ in range(problem.horizon):
+            stop = self._stop(states[-1])
             if stop is None:
                 break
-            u[:] = last = problem.limited(stop[None], last)[0]
-            x = model.step(x, u)
-        return self._judged(step, problem.limited(U, step.u_last), status)
+            last = problem.limited(stop[None], last)[0]
+            inputs.append(last)
+            states.append(problem.model.step(states[-1], last))
+        return np.array(inputs).reshape(-1, problem.model.nu), np.array(states)
+
+    def depths(self, step: Step, inputs: FloatArray) -> FloatArray:
+        """How deep (J, C) [m] a plan enters the no-go sets, by its own motion between the nodes."""
+        return self._judged(step, inputs, Status.PREVIOUS).iterate.slack[: step.count]
 
     def _stop(self, x: FloatArray) -> FloatArray | None:
         """The input (nu,) that stops the robot, as far as the bounds allow; None at rest."""

@@ -195,6 +195,20 @@ class SCP:
         step = Step.read(self.problem, x0, x_ref, (), nodes=self._nodes, u_last=u_last)
         return self._plan(step, Found(self._fallback.brake(step, status)), clock)
 
+    def follow(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        inputs: FloatArray,
+        robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
+    ) -> Plan:
+        """Judge inputs (N, nu) that are known, as `Status.PREVIOUS` if they hold."""
+        given = self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
+        step = Step.read(*given)
+        return self._plan(step, Found(self._fallback.keep(step, inputs)), Clock())
+
     def clock(self) -> Clock:
         """The clock of a step that begins now."""
         return Clock(self.settings.deadline, self._pace)
