@@ -19,7 +19,9 @@ class Status(Enum):
 
     CONVERGED = "The KKT conditions of the original problem hold to the tolerance."
     FEASIBLE = "The plan meets every constraint, but the search ended before it was optimal."
-    PREVIOUS = "Nothing better in time: the last plan, shifted, meets every constraint as of now."
+    PREVIOUS = (
+        "Nothing better in time, or no way to rest after it: a known plan meets every constraint."
+    )
     BRAKING = "Nothing better in time: the robot brakes and meets every constraint while it does."
     SOFTENED = "No plan that meets every constraint was found; this one violates them by its slack."
     VIOLATING = "The search ended while the plan still violates a constraint."
