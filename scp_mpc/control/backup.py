@@ -27,6 +27,8 @@ from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 
 _SECONDS = 4.0  # of braking that are looked at, at least
+_SPEEDS = 2.0 ** np.arange(-3, 5)  # [m/s] from which braking is tried out
+_AT_REST = 0.05  # [m/s] of the position after braking, where it does not end sooner
 _RESERVE = 1.5  # of way and time of braking over those straight on
 
 
@@ -38,22 +40,22 @@ class Backup:
         tolerance: Violation that is none [m].
     """
 
-    _speeds = 2.0 ** np.arange(-3, 5)  # [m/s]
-
     def __init__(self, problem: Problem, tolerance: float) -> None:
         """Lay out the nodes of the time after a plan."""
         stages = max(problem.horizon, int(np.ceil(_SECONDS / problem.model.dt)))
         self._problem, self._tolerance = replace(problem, horizon=stages), tolerance
         self._nodes = Nodes.of(self._problem)
         self._fallback = Fallback(self._problem, tolerance)
-        start = np.zeros(problem.model.dim)
-        ways = []
-        for speed in self._speeds:
+        start, table = np.zeros(problem.model.dim), [(0.0, 0.0, 0.0)]
+        for speed in _SPEEDS:
             x = problem.model.state(start, speed * np.eye(len(start))[0])
-            path = self._fallback.stopping(x)[1][:, problem.model.position]
+            stop, states = self._fallback.stopping(x)
+            path = states[:, problem.model.position]
+            if not (np.isfinite(path).all() and self._rests(path, len(stop))):
+                break
             length = float(np.linalg.norm(path - path[0], axis=1).max())
-            ways.append((length, (len(path) - 1) * problem.model.dt))
-        self._braking = np.array(ways).T  # way [m] and time [s] over speeds
+            table.append((speed, length, len(stop) * problem.model.dt))
+        self._speeds, *self._braking = np.array(table).T  # way [m] and time [s] over speeds [m/s]
         self._body = problem.robot_radius + float(np.abs(problem.discs).max())
 
     def of(
@@ -105,9 +107,10 @@ class Backup:
         k = len(inputs)
         if k == 0 or not obstacles:
             return True
-        if k > self._problem.horizon:
+        path = states[:, self._problem.model.position]
+        if not self._rests(path, k):
             return False
-        near = self._near(states[:, self._problem.model.position], obstacles, stage)
+        near = self._near(path, obstacles, stage)
         if not len(near):
             return True
         rest = np.tile(self._problem.model.equilibrium_input, (self._problem.horizon - k, 1))
@@ -115,6 +118,12 @@ class Backup:
         step = Step.read(self._problem, states[0], states[0], later, nodes=self._nodes)
         depths = self._fallback.depths(step, np.concatenate([inputs, rest]))
         return bool(self._nodes.stages(depths)[:, :k].max(initial=0.0) <= self._tolerance)
+
+    def _rests(self, path: FloatArray, count: int) -> bool:
+        """Whether so many inputs come to rest within the time that is looked at."""
+        if count < self._problem.horizon:
+            return True
+        return float(np.linalg.norm(path[-1] - path[-2])) <= _AT_REST * self._problem.model.dt
 
     def _near(
         self, path: FloatArray, obstacles: Sequence[ObstaclePrediction], stage: int
