@@ -4,62 +4,47 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import inf
-from time import perf_counter
+from time import perf_counter, thread_time
 
 _FORGET = 0.02  # of the difference to a shorter time, each time it is measured
 _EASE = 0.98  # of a time, each time that it stood in the way
-_SPIKE = 3.0  # times what was known: perhaps a hiccup of the machine
+_HICCUP = 3.0  # times its own processor time: then most of a task's time was somebody else's
 _LEAST = 1e-6  # [s] of any task
-_PATIENCE = 3  # times that a task is not begun before it is tried all the same; then twice as many
-_MOST_PATIENCE = 48
+
+Mark = tuple[float, float]  # seconds since the step began, and of its thread's processor time
 
 
 class Pace:
     """How long tasks took lately: their longest times, slowly forgotten.
 
     One serves all steps of a controller, so that the first iteration of a step is predicted from
-    those of earlier steps. A sudden long time is forgotten at once if the next one is as before. A
-    task that seems too long is tried again after a while, for nothing is learnt about what is never
-    begun; if it still is too long, after twice as long a while.
+    those of earlier steps. A single time in which the machine did something else is no time of the
+    task's; it counts if it happens twice in a row.
     """
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
         self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._before: dict[str, float] = {}  # what was known before a sudden long time
-        self._waited: defaultdict[str, int] = defaultdict(int)
-        self._patience: defaultdict[str, int] = defaultdict(lambda: _PATIENCE)
+        self._stalled: set[str] = set()
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
         return self._seconds[task]
 
-    def learn(self, task: str, seconds: float) -> None:
-        """Take note of a measured time."""
-        known, before = self._seconds[task], self._before.pop(task, None)
-        tried = self._waited[task] > 0 or self._patience[task] > _PATIENCE
-        self._waited[task] = 0
-        if tried and seconds <= known / 2:  # it stood in the way for nothing
-            self._seconds[task], self._patience[task] = seconds, _PATIENCE
-        elif before is not None and _SPIKE * seconds < known:
-            self._seconds[task] = max(before, seconds)
+    def learn(self, task: str, seconds: float, worked: float = inf) -> None:
+        """Take note of a measured time, and of the processor time within it."""
+        if seconds > _HICCUP * worked + _LEAST:
+            again = task in self._stalled
+            self._stalled.add(task)
+            seconds = seconds if again else worked
         else:
-            if 0 < _SPIKE * known < seconds:
-                self._before[task] = known
-            self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
+            self._stalled.discard(task)
+        known = self._seconds[task]
+        self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
 
-    def tries(self, task: str) -> bool:
-        """Whether to begin a task that is expected to take too long, to see whether it does.
-
-        Each time that it is not, a little less is expected: what is hardly too long is soon begun.
-        """
+    def ease(self, task: str) -> None:
+        """Expect a little less, after a task was not begun: or it would never be again."""
         self._seconds[task] *= _EASE
-        self._waited[task] += 1
-        if self._waited[task] <= self._patience[task]:
-            return False
-        self._waited[task] = 0
-        self._patience[task] = min(2 * self._patience[task], _MOST_PATIENCE)
-        return True
 
 
 class Clock:
@@ -79,12 +64,15 @@ class Clock:
         self._pace = Pace() if pace is None else pace
         self.spent: defaultdict[str, float] = defaultdict(float)
         self._began = self._lap = perf_counter()
-        self._booked = 0.0  # [s] of tasks
-        self._tried: set[str] = set()  # to be begun although they seem too long, and not begun yet
+        self._booked = 0.0, 0.0  # seconds and processor time of tasks
 
     def elapsed(self) -> float:
         """Seconds since the step began."""
         return perf_counter() - self._began
+
+    def mark(self) -> Mark:
+        """Where time stands now, for `learn`."""
+        return self.elapsed(), thread_time()
 
     def charge(self, what: str) -> None:
         """Book the time since it was last booked."""
@@ -96,10 +84,11 @@ class Clock:
         """Whether a task, and what ends the step, are predicted to end before the deadline."""
         if self._deadline == inf:
             return True
-        needed, left = self._pace.expected(task), self._deadline - self.elapsed()
-        if needed + self._pace.expected("ending") <= left:
+        needed = self._pace.expected(task) + self._pace.expected("ending")
+        if needed <= self._deadline - self.elapsed():
             return True
-        return left > 0 and self._tries(task)
+        self._pace.ease(task)
+        return False
 
     def room(self, task: str, most: int, then: str = "") -> int:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
@@ -108,27 +97,24 @@ class Clock:
         after = self._pace.expected(then) + self._pace.expected("ending")
         spare = self._deadline - self.elapsed() - after
         times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
-        return 1 if times == 0 and most > 0 and spare > 0 and self._tries(task) else times
+        if times < most:
+            self._pace.ease(task)
+        return times
 
     @contextmanager
     def task(self, name: str) -> Iterator[None]:
         """Measure what is done within it, less the tasks within."""
-        began, booked = self.elapsed(), self._booked
+        began, booked = self.mark(), self._booked
         yield
-        own = self.elapsed() - began - (self._booked - booked)
-        self._booked += own
-        self._tried.discard(name)
-        self._pace.learn(name, own)
+        now = self.mark()
+        own = [now[i] - began[i] - (self._booked[i] - booked[i]) for i in (0, 1)]
+        self._booked = self._booked[0] + own[0], self._booked[1] + own[1]
+        self._pace.learn(name, *own)
 
-    def learn(self, task: str, since: float, times: int = 1) -> None:
-        """Note that a task, done so many times, took from `since`, in seconds `elapsed`, on."""
+    def learn(self, task: str, since: Mark, times: int = 1) -> None:
+        """Note that a task, done so many times, took from `since` on until now."""
         if times:
-            seconds = self.elapsed() - since
-            self._booked += seconds
-            self._tried.discard(task)
-            self._pace.learn(task, seconds / times)
-
-    def _tries(self, task: str) -> bool:
-        if task not in self._tried and self._pace.tries(task):
-            self._tried.add(task)
-        return task in self._tried
+            now = self.mark()
+            own = now[0] - since[0], now[1] - since[1]
+            self._booked = self._booked[0] + own[0], self._booked[1] + own[1]
+            self._pace.learn(task, own[0] / times, own[1] / times)

@@ -174,7 +174,7 @@ def _attempt(
     point = _run(solver, effort)
     if point is None:
         return Settled(None, 0)
-    most, began = clock.room("repair", repairs), clock.elapsed()
+    most, began = clock.room("repair", repairs), clock.mark()
     end = settled(qp, *rows.active(point[1], solver.noise), most)
     clock.learn("repair", began, end.systems)
     if end.solution is None and qp.proves_infeasible(rows.forces(point[1])):

@@ -111,7 +111,7 @@ class MultiStart:
         most = clock.room("candidate", most, then="iteration")
         if not most:
             return Found(best)
-        began = clock.elapsed()
+        began = clock.mark()
         here = PassingPattern(at.path(best.nominal.y)[1:], best.iterate.touched[: step.count])
         full = np.full(at.problem.max_obstacles, at.problem.size.reference)
         candidates, numbers = candidate_paths(step, free, here.path, full, most), Counter[int]()
@@ -255,7 +255,7 @@ class MultiStart:
             most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
             if not paths or not most:
                 break
-            began = clock.elapsed()
+            began = clock.mark()
             looks = self._rank(best, about, paths[:most], [None] * len(paths[:most]), True)
             more = [one for one in looks if one is not None]
             clock.learn("candidate", began, len(more))

@@ -257,7 +257,7 @@ class SCP:
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
             if isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
-            ending = clock.elapsed()
+            ending = clock.mark()
             best = self._rescued(step, last, found.best)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
                 best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))

@@ -187,7 +187,7 @@ class Transcription:
         active = np.zeros(len(qp.F), dtype=np.intp)
         if guess is not None and guess.multipliers is not None:
             active[:] = -np.sign(self._reaction(guess.multipliers))
-        most, began = self.clock.room("repair", _REPAIRS, then="iteration"), self.clock.elapsed()
+        most, began = self.clock.room("repair", _REPAIRS, then="iteration"), self.clock.mark()
         end = settled(qp, active, np.zeros(len(active), dtype=np.bool_), most)
         self.clock.learn("repair", began, end.systems)
         self.clock.charge("solve")

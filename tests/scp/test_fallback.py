@@ -131,7 +131,7 @@ def test_predictions_of_time_are_long_times_slowly_forgotten():
     tries = 1
     while not clock.allows("program"):  # what was never begun must not be shut out for ever
         tries += 1
-    assert 1 < tries < 6
+    assert 10 < tries < 60
     assert Clock(None, pace).allows("program")
 
 
@@ -150,7 +150,9 @@ def slowed(monkeypatch, seconds):
 
     def slow(self, *given):
         begun.append(self)
-        time.sleep(seconds)
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:  # it works, and does not wait
+            pass
         return solve(self, *given)
 
     monkeypatch.setattr(ProgramSolver, "solve", slow)
