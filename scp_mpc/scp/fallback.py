@@ -32,16 +32,9 @@ class Fallback:
         self._rest = np.clip(problem.model.equilibrium_input, problem.u_min, problem.u_max)
 
     def best(self, step: Step, last: Iterate | None) -> Result:
-        """The last plan, if it meets every constraint; else braking, whether it does or not.
-
-        Its last input is held one interval longer; or the robot brakes there.
-        """
-        if last is not None:
-            for inputs in (last.inputs, self._braked(step, last.inputs)):
-                kept = self.keep(step, inputs)
-                if kept.status.ok:
-                    return kept
-        return self.brake(step)
+        """The last plan, if it meets every constraint; else braking, whether it does or not."""
+        kept = None if last is None else self.keep(step, last.inputs)
+        return kept if kept is not None and kept.status.ok else self.brake(step)
 
     def lesser(self, found: Result, braking: Result) -> Result:
         """Of two plans with a violation, a certified one, else the one with less.
@@ -99,14 +92,6 @@ class Fallback:
         wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
         stop: FloatArray = rest + wanted / max(1.0, float((wanted / room).max()))
         return stop
-
-    def _braked(self, step: Step, inputs: FloatArray) -> FloatArray:
-        """Inputs (N, nu), the last one instead of which brakes."""
-        x = step.x0
-        for u in inputs[:-1]:
-            x = self._problem.model.step(x, u)
-        stop = self._stop(x)
-        return np.concatenate([inputs[:-1], (self._rest if stop is None else stop)[None]])
 
     def _judged(self, step: Step, inputs: FloatArray, status: Status) -> Result:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
