@@ -28,6 +28,7 @@ from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
 from scp_mpc.scp.step import Step
 from scp_mpc.settings import Settings
+from scp_mpc.trajectory import rollout
 
 _log = logging.getLogger(__name__)
 
@@ -133,6 +134,7 @@ class MPC:
                 with clock.task("backup"):
                     given = x0, x_ref, recall.obstacles, robot_covariance, last
                     plan, backup = self._backed(plan, *given)
+                plan = replace(plan, timing=replace(plan.timing, total=clock.elapsed()))
             sound = self._within(plan, last)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref, last)
@@ -196,10 +198,9 @@ class MPC:
         backup = self._backups.of(plan.X, plan.U, obstacles) if plan.status.ok else None
         if backup is not None or self._backup is None:
             return plan, backup
-        model, N, states = self.problem.model, self.problem.horizon, [plan.X[0]]
-        for u in self._backup:
-            states.append(model.step(states[-1], u))
-        stop, path = self._backups.stopping(states[-1])
+        model, N = self.problem.model, self.problem.horizon
+        end = rollout(model.step, plan.X[0], self._backup).states[-1]
+        stop, path = self._backups.stopping(end)
         rest = np.tile(model.equilibrium_input, (N, 1))
         inputs = np.concatenate([self._backup, stop, rest])[:N]
         other = self._solver.follow(x0, x_ref, obstacles, inputs, robot_covariance, last)

@@ -1,5 +1,7 @@
 """Backups: a plan that is ok is followed by one that is, where the world keeps its word."""
 
+import time
+
 import numpy as np
 import pytest
 from static_worlds import World
@@ -107,6 +109,14 @@ def test_a_backup_is_the_plan_or_its_first_input():
             np.testing.assert_array_equal(known, inputs[1 : 1 + len(known)])
         lengths.add(None if known is None else len(known))
     assert lengths == {None, 0, 7}
+
+
+def test_its_time_counts(monkeypatch):
+    """In `plan.timing.total`, from which `overruns` are counted."""
+    problem = Problem(DoubleIntegrator(0.1), horizon=8, max_obstacles=1, **KNOWN)
+    walls = [ObstaclePrediction.static(8, [3.0, 0.0], 0.0, shape=BOX)]
+    monkeypatch.setattr(Backup, "of", lambda *_: time.sleep(0.05))
+    assert MPC(problem).step(np.zeros(4), np.zeros(4), walls).timing.total >= 0.05
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["standing", "moving"])
