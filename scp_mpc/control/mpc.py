@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.backup import Backup
-from scp_mpc.control.memory import ObstacleMemory, Recall
+from scp_mpc.control.obstacle_memory import ObstacleMemory, Recall
 from scp_mpc.deadline import Clock
 from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction

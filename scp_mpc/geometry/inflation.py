@@ -31,7 +31,7 @@ from scp_mpc.arrays import FloatArray, IntArray
 from scp_mpc.geometry.ellipsoid import signed_distance
 from scp_mpc.geometry.no_go import HalfSpaces, NoGoSets
 from scp_mpc.geometry.polytopes import Polytopes
-from scp_mpc.geometry.tangents import inverse_root, tangents
+from scp_mpc.geometry.tangent_basis import inverse_root, tangents
 
 _POINT = 1e-9  # [m] a semi-axis below this is that of a point
 

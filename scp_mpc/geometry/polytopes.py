@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, IntArray
-from scp_mpc.geometry.tangents import tangents
+from scp_mpc.geometry.tangent_basis import tangents
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.solid import Solid
 

@@ -23,7 +23,7 @@ from scp_mpc import (
     StalenessPolicy,
     Status,
 )
-from scp_mpc.control.memory import ObstacleMemory
+from scp_mpc.control.obstacle_memory import ObstacleMemory
 
 # Wrong clocks, missing stamps, same names
 

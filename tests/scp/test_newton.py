@@ -18,7 +18,7 @@ from scp_mpc import (
 from scp_mpc.deadline import Clock
 from scp_mpc.geometry import NoGoSets
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation
-from scp_mpc.geometry.tangents import inverse_root, tangents
+from scp_mpc.geometry.tangent_basis import inverse_root, tangents
 from scp_mpc.qp.active_set import CondensedQP, settled
 from scp_mpc.scp import loop
 from scp_mpc.scp.loop import Loop
