@@ -23,6 +23,11 @@ def provenance() -> dict[str, str | int | None]:
     }
 
 
+def library_version() -> str:
+    """Version of the installed library."""
+    return version("scp-mpc")
+
+
 def _processor() -> str:
     """The processor's model on Linux, else what the platform calls it."""
     try:

@@ -29,6 +29,8 @@ from scp_mpc.simulation.drive import (
     World,
     drive,
 )
+from scp_mpc.simulation.episodes import run_episodes
+from scp_mpc.simulation.events import Contact, find_contacts
 from scp_mpc.simulation.flight import Flight
 from scp_mpc.simulation.gust import DrydenGust
 from scp_mpc.simulation.lag import ActuatorLag
@@ -37,6 +39,7 @@ from scp_mpc.simulation.meetings import (
     find_meetings,
 )
 from scp_mpc.simulation.overtaking import Overtaking
+from scp_mpc.simulation.plant import ModelPlant, Plant
 from scp_mpc.simulation.realisations import (
     COUPLINGS,
     applicable_couplings,
@@ -55,12 +58,15 @@ from scp_mpc.simulation.replay import (
     replay,
     replay_problem,
 )
+from scp_mpc.simulation.run import Run
 from scp_mpc.simulation.scenarios import (
     DT,
     SCENARIOS,
     STEPS,
     Scenario,
 )
+from scp_mpc.simulation.scene import Body, Scene
+from scp_mpc.simulation.sensor import PerfectSensor, Sensor, TrackedSensor
 
 __all__ = [
     "COUPLINGS",
@@ -70,8 +76,10 @@ __all__ = [
     "STEPS",
     "TRACKING",
     "ActuatorLag",
+    "Body",
     "ClosedLoop",
     "ConstantPush",
+    "Contact",
     "Controller",
     "CorrelatedDisturbance",
     "Coverage",
@@ -84,23 +92,32 @@ __all__ = [
     "Flight",
     "LeadCoverage",
     "Meeting",
+    "ModelPlant",
     "Overtaking",
     "Pass",
+    "PerfectSensor",
+    "Plant",
     "Recording",
     "RecordingError",
     "Replay",
+    "Run",
     "Scenario",
+    "Scene",
+    "Sensor",
+    "TrackedSensor",
     "World",
     "applicable_couplings",
     "contacts",
     "control_steps",
     "drive",
+    "find_contacts",
     "find_meetings",
     "measure_coverage",
     "read_recording",
     "replay",
     "replay_problem",
     "robot_path",
+    "run_episodes",
     "sample_paths",
     "sampled_contacts",
     "simulate",
