@@ -83,7 +83,7 @@ def find_meetings(run: Run) -> list[Meeting]:
         if not np.isfinite(clearances).any():
             continue
         step = int(clearances.argmin())
-        piece = int(run.gaps[:, step, body].argmin())
+        piece = int(run.gaps(body)[:, step].argmin())
         found.append(
             Meeting(
                 body=body,
@@ -102,8 +102,9 @@ def find_contacts(run: Run) -> list[Contact]:
     found = []
     apart = int(np.ceil(_APART / run.problem.model.dt * FINE))
     for body in np.flatnonzero((run.clearances <= 0).any(axis=0)):
-        inner, last = run.gaps[:-1, :, body], run.gaps[-1, -1:, body]
-        gaps = np.concatenate([inner.T.ravel(), last])  # an interval's end begins the next one
+        within = run.gaps(int(body))
+        # an interval's end begins the next one
+        gaps = np.concatenate([within[:-1].T.ravel(), within[-1, -1:]])
         touching = np.flatnonzero(gaps <= 0)
         for event in np.split(touching, np.flatnonzero(np.diff(touching) > apart) + 1):
             depth = -float(gaps[event[0] : event[-1] + 1].min())

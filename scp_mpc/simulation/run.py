@@ -92,16 +92,23 @@ class Run:
 
         Negative where they overlap; infinite where the body is absent at either end.
         """
-        return self.gaps.min(axis=0, initial=np.inf)
+        least = [self.gaps(body).min(axis=0) for body in range(len(self.scene.bodies))]
+        return np.array(least).T.reshape(self.steps, -1)
 
-    @cached_property
-    def gaps(self) -> FloatArray:
-        """(FINE+1, K, M) true distances of robot and body within each interval [m]."""
-        discs = disc_centres(self.problem.model, self._within, self.problem.discs)
-        share = np.linspace(0.0, 1.0, FINE + 1)
-        parts = [self._gap(j, body, discs, share) for j, body in enumerate(self.scene.bodies)]
-        shape = (*self._within.shape[:2], len(parts))
-        return np.stack(parts, axis=-1) if parts else np.zeros(shape)
+    def gaps(self, body: int) -> FloatArray:
+        """(FINE+1, K) true distances of robot and one body within each interval [m].
+
+        Infinite where it is absent at either end.
+        """
+        what, share = self.scene.bodies[body], np.linspace(0.0, 1.0, FINE + 1)[:, None, None]
+        begin, end = self.bodies[:-1, body], self.bodies[1:, body]
+        there = ~np.isnan(begin + end).any(axis=1)
+        way = begin[there] + share * (end - begin)[there]
+        discs = disc_centres(self.problem.model, self._within[:, there], self.problem.discs)
+        nearest = separation(what, discs - way[:, :, None])[0].min(axis=2)
+        gaps = np.full((FINE + 1, self.steps), np.inf)
+        gaps[:, there] = nearest - what.radius - self.problem.robot_radius
+        return gaps
 
     @cached_property
     def path(self) -> FloatArray:
@@ -115,15 +122,6 @@ class Run:
         states = self.problem.model.advance(self.states[None, :-1], self.inputs[None], share)
         states[-1] = self.states[1:]
         return states
-
-    def _gap(self, j: int, body: Body, discs: FloatArray, share: FloatArray) -> FloatArray:
-        """(FINE+1, K) distances to one body."""
-        begin, end = self.bodies[:-1, j], self.bodies[1:, j]
-        there = begin + share[:, None, None] * (end - begin)
-        away = discs - there[:, :, None]
-        distance = separation(body, away)[0]
-        nearest = distance.min(axis=2) - body.radius - self.problem.robot_radius
-        return np.where(np.isnan(nearest), np.inf, nearest)
 
 
 def separation(body: Body, away: FloatArray) -> tuple[FloatArray, FloatArray]:

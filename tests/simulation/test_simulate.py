@@ -115,7 +115,7 @@ def test_a_plant_that_is_pushed():
     )
     assert pushed.states[-1, 0] > 0.01
     assert pushed.bodies.shape == (31, 0, 2)
-    assert pushed.gaps.shape == (33, 30, 0)
+    assert pushed.clearances.shape == (30, 0)
     assert find_meetings(pushed) == find_contacts(pushed) == []
 
 
