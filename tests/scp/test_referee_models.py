@@ -48,6 +48,24 @@ def test_both_referees_agree(kind):
     np.testing.assert_allclose(verdict.X, other.X, atol=1e-4)
 
 
+@pytest.mark.parametrize("inflation", ["exact", "axes"])
+def test_a_referee_may_be_taken_to_another_step(inflation):
+    here, there = (instance(kind, 8, inflation, 0.5, 1) for kind in ("elongated", "crossing"))
+    plan = SCP(there.problem, Settings()).solve(there.x0, there.x_ref, there.obstacles)
+
+    def given(step, one):
+        return step.x0, step.x_ref, (step.obstacles[0] if one else step.obstacles)
+
+    for kind in (Referee, ModelReferee) if inflation == "exact" else (Referee,):
+        one = kind is Referee
+        first = kind(here.problem, *given(here, one))
+        new = kind(there.problem, *given(there, one))
+        moved = first.at(*given(there, one))
+        assert moved.kkt(plan) == pytest.approx(new.kkt(plan), abs=1e-12)
+        assert first.kkt(plan)["violation"] > 1e-2  # and it stays where it is
+        assert first.kkt(plan)["defect"] > 1e-2
+
+
 def test_it_judges_several_obstacles():
     step = instance("beside", 8, "exact", 5.991**0.5, 1)
     problem = Problem(**{**vars(step.problem), "max_obstacles": 2})

@@ -36,6 +36,7 @@ class Bounded(Referee):
         ]
         program = {
             "x": casadi.vertcat(self.z, self.theta, casadi.vec(E), slack),
+            "p": self.parameters,
             "f": self.cost
             + problem.state_slack_weight * casadi.sum1(casadi.vec(E))
             + problem.slack_weight * casadi.sum1(slack),
@@ -61,6 +62,7 @@ class Bounded(Referee):
         lower, upper = [-INF] * self.size_x, [INF] * self.size_x
         paid = np.zeros(plan.x_slack.size + N)
         found = self.solver(
+            p=self.p,
             x0=np.concatenate(start),
             lbx=np.concatenate([lower, np.tile(problem.u_min, N), [margin.lower], theta - 7, paid]),
             ubx=np.concatenate(

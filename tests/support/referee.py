@@ -5,6 +5,7 @@ Nothing here comes from the package but the numbers of the problem. The signed d
 n'(p - mu) - s sqrt(n' Sigma n) >= r, so theta joins the variables.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import casadi
@@ -27,39 +28,63 @@ class Verdict:
 
 
 class Referee:
-    """The hard problem with one planar obstacle, over w = [X_1..N | U | s | theta]."""
+    """The hard problem with one planar obstacle, over w = [X_1..N | U | s | theta].
+
+    The numbers of the step are parameters of the program, so that `at` another one nothing is
+    derived or compiled again.
+    """
 
     def __init__(self, problem: Problem, x0, x_ref, obstacle: ObstaclePrediction) -> None:
-        self.problem, self.obstacle = problem, obstacle
+        self.problem = problem
         N, model, margin = problem.horizon, problem.model, problem.margin
         X, U = casadi.SX.sym("X", model.nx, N), casadi.SX.sym("U", model.nu, N)
         s, theta = casadi.SX.sym("s"), casadi.SX.sym("theta", N)
+        start, ref = casadi.SX.sym("x0", model.nx), casadi.SX.sym("x_ref", model.nx, N)
+        means, Sigmas = casadi.SX.sym("mu", 2, N), casadi.SX.sym("Sigma", 2, 2 * N)
+        axes, deviations = casadi.SX.sym("axes", 2, 2 * N), casadi.SX.sym("deviations", 2, N)
+        reach = casadi.SX.sym("r")
         Q, R = casadi.DM(problem.Q), casadi.DM(problem.R)
         cost = margin.weight * (s - margin.reference) ** 2
         defects, outside = [], []
-        previous = casadi.DM(x0)
-        reach = problem.robot_radius + obstacle.radius
+        previous = start
         for i in range(N):
-            error = X[:, i] - casadi.DM(x_ref[i + 1])
+            error = X[:, i] - ref[:, i]
             cost += error.T @ Q @ error + U[:, i].T @ R @ U[:, i]
             defects.append(X[:, i] - model.A @ previous - model.B @ U[:, i])
             previous = X[:, i]
-            delta = casadi.vertcat(X[0, i], X[2, i]) - casadi.DM(obstacle.means[i + 1])
-            Sigma = obstacle.covariances[i + 1]
+            delta = casadi.vertcat(X[0, i], X[2, i]) - means[:, i]
             if problem.inflation == "axes":
-                variances, axes = np.linalg.eigh(Sigma)
-                y = casadi.DM(axes).T @ delta
-                semi = s * casadi.DM(np.sqrt(variances)) + reach
+                y = axes[:, 2 * i : 2 * i + 2].T @ delta
+                semi = s * deviations[:, i] + reach
                 outside.append(casadi.sqrt(casadi.sumsqr(y / semi)) - 1)
             else:
                 n = casadi.vertcat(casadi.cos(theta[i]), casadi.sin(theta[i]))
-                spread = casadi.sqrt(n.T @ casadi.DM(Sigma) @ n)
+                spread = casadi.sqrt(n.T @ Sigmas[:, 2 * i : 2 * i + 2] @ n)
                 outside.append(n.T @ delta - s * spread - reach)
         self.z = casadi.vertcat(casadi.vec(X), casadi.vec(U), s)
         self.theta = theta
         self.cost = cost
         self.defects, self.outside = casadi.vertcat(*defects), casadi.vertcat(*outside)
         self.size_x, self.size_u = N * model.nx, N * model.nu
+        parameters = (start, ref, means, Sigmas, axes, deviations, reach)
+        self.parameters = casadi.vertcat(*map(casadi.vec, parameters))
+        self.compiled: dict[str, casadi.Function] = {}
+        self._given(x0, x_ref, obstacle)
+
+    def at(self, x0, x_ref, obstacle: ObstaclePrediction) -> "Referee":
+        """The same problem at another step."""
+        other = copy(self)
+        other._given(x0, x_ref, obstacle)
+        return other
+
+    def _given(self, x0, x_ref, obstacle: ObstaclePrediction) -> None:
+        self.obstacle = obstacle
+        Sigmas = obstacle.covariances[1:]
+        variances, axes = np.linalg.eigh(Sigmas)
+        by_columns = axes.transpose(0, 2, 1)
+        numbers = x0, x_ref[1:], obstacle.means[1:], Sigmas, by_columns, np.sqrt(variances)
+        reach = self.problem.robot_radius + obstacle.radius
+        self.p = np.concatenate([*map(np.ravel, numbers), [reach]])
 
     def angles(self, positions: np.ndarray, s: float) -> np.ndarray:
         """Angle of the outward normal at each position, by search on a grid and bisection."""
@@ -85,19 +110,21 @@ class Referee:
         duals = plan.multipliers
         assert duals is not None
         theta = self.angles(plan.X[1:, [0, 2]], float(plan.s[0]))
-        y_defects = casadi.SX.sym("y_defects", self.defects.numel())
-        y_outside = casadi.SX.sym("y_outside", len(theta))
-        lagrangian = self.cost + y_defects.T @ self.defects + y_outside.T @ self.outside
-        evaluate = casadi.Function(
-            "kkt",
-            [self.z, self.theta, y_defects, y_outside],
-            [casadi.gradient(lagrangian, self.z), self.defects, self.outside],
-        )
+        if "kkt" not in self.compiled:
+            y_defects = casadi.SX.sym("y_defects", self.defects.numel())
+            y_outside = casadi.SX.sym("y_outside", len(theta))
+            lagrangian = self.cost + y_defects.T @ self.defects + y_outside.T @ self.outside
+            self.compiled["kkt"] = casadi.Function(
+                "kkt",
+                [self.z, self.theta, self.parameters, y_defects, y_outside],
+                [casadi.gradient(lagrangian, self.z), self.defects, self.outside],
+            )
+        evaluate = self.compiled["kkt"]
         scale = self._row_scale()
         z = np.concatenate([plan.X[1:].ravel(), plan.U.ravel(), plan.s])
         gradient, defects, outside = (
             np.array(v).ravel()
-            for v in evaluate(z, theta, duals.dynamics.ravel(), duals.obstacles[0] * scale)
+            for v in evaluate(z, theta, self.p, duals.dynamics.ravel(), duals.obstacles[0] * scale)
         )
         gradient[self.size_x : -1] += duals.inputs.ravel()
         gradient[-1] += duals.margin[0]
@@ -124,22 +151,9 @@ class Referee:
         """Run IPOPT from a plan; `near` keeps the barrier small so that it stays close by."""
         problem, N = self.problem, self.problem.horizon
         theta = self.angles(X[1:, [0, 2]], s)
-        w = casadi.vertcat(self.z, self.theta)
-        nlp = {"x": w, "f": self.cost, "g": casadi.vertcat(self.defects, self.outside)}
-        options = {
-            "print_time": False,
-            "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 2000},
-        }
-        if near:
-            options["ipopt"] |= {
-                "mu_init": 1e-9,
-                "bound_push": 1e-10,
-                "bound_frac": 1e-10,
-                "slack_bound_push": 1e-10,
-                "slack_bound_frac": 1e-10,
-            }
-        free = np.full(self.size_x, np.inf)
-        result = (solver := casadi.nlpsol("referee", "ipopt", nlp, options))(
+        solver, free = self._ipopt(near), np.full(self.size_x, np.inf)
+        result = solver(
+            p=self.p,
             x0=np.concatenate([X[1:].ravel(), U.ravel(), [s], theta]),
             lbx=np.concatenate(
                 [-free, np.tile(problem.u_min, N), [problem.margin.lower], np.full(N, -np.inf)]
@@ -156,6 +170,27 @@ class Referee:
         size = float(w[self.size_x + self.size_u])
         ok = bool(solver.stats()["success"])
         return Verdict(np.vstack([X[:1], ends]), inputs, size, float(result["f"]), ok)
+
+    def _ipopt(self, near: bool) -> casadi.Function:
+        which = "near" if near else "far"
+        if which not in self.compiled:
+            w = casadi.vertcat(self.z, self.theta)
+            rows = casadi.vertcat(self.defects, self.outside)
+            nlp = {"x": w, "p": self.parameters, "f": self.cost, "g": rows}
+            options = {
+                "print_time": False,
+                "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 2000},
+            }
+            if near:
+                options["ipopt"] |= {
+                    "mu_init": 1e-9,
+                    "bound_push": 1e-10,
+                    "bound_frac": 1e-10,
+                    "slack_bound_push": 1e-10,
+                    "slack_bound_frac": 1e-10,
+                }
+            self.compiled[which] = casadi.nlpsol("referee", "ipopt", nlp, options)
+        return self.compiled[which]
 
     def _row_scale(self) -> np.ndarray:
         """The package measures the `axes` constraint in metres: times the short semi-axis."""

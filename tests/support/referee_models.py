@@ -7,6 +7,7 @@ by its three entries in space. The sizes s are fixed, and nothing is softened.
 """
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import casadi
@@ -48,6 +49,9 @@ def symbolic(model) -> Callable:
 class ModelReferee:
     """The hard problem over w = [X_1..N | U | n], with any number of obstacles.
 
+    The numbers of the step are parameters of the program, so that `at` another one nothing is
+    derived or compiled again.
+
     Args:
         problem: model, horizon, Q, R, Qf, u_min, u_max, robot_radius are read, and
             `size.reference` where no `size` is given.
@@ -62,7 +66,7 @@ class ModelReferee:
     def __init__(
         self, problem, x0, x_ref, obstacles, *, size=None, u_before=None, dynamics=None, **bounds
     ) -> None:
-        self.problem, self.obstacles = problem, obstacles
+        self.problem = problem
         self.size = float(problem.size.reference if size is None else size)
         model, N = problem.model, problem.horizon
         advance = dynamics or symbolic(model)
@@ -71,6 +75,10 @@ class ModelReferee:
         X, U = casadi.SX.sym("X", self.nx, N), casadi.SX.sym("U", self.nu, N)
         self.width = 1 if self.dim == 2 else 3
         sides = casadi.SX.sym("n", self.width, N * len(obstacles))
+        start, ref = casadi.SX.sym("x0", self.nx), casadi.SX.sym("x_ref", self.nx, N)
+        means = casadi.SX.sym("mu", self.dim, N * len(obstacles))
+        spreads = casadi.SX.sym("Sigma", self.dim, self.dim * N * len(obstacles))
+        reaches = casadi.SX.sym("r", len(obstacles))
         weights = [casadi.DM(W) for W in (problem.Q, problem.Qf, problem.R)]
         cost, rows, lower, upper = 0, [], [], []
         self.kinds: list[str] = []  # of all rows
@@ -81,9 +89,9 @@ class ModelReferee:
             lower.append(np.broadcast_to(low, row.numel()))
             upper.append(np.broadcast_to(high, row.numel()))
 
-        previous, idle = casadi.DM(x0), casadi.DM(model.equilibrium_input)
+        previous, idle = start, casadi.DM(model.equilibrium_input)
         for i in range(N):
-            error = X[:, i] - casadi.DM(x_ref[i + 1])
+            error = X[:, i] - ref[:, i]
             cost += casadi.bilin(weights[i == N - 1], error) + casadi.bilin(
                 weights[2], U[:, i] - idle
             )
@@ -93,18 +101,21 @@ class ModelReferee:
             if before is not None and {"du_min", "du_max"} & set(bounds):
                 low, high = bounds.get("du_min", -np.inf), bounds.get("du_max", np.inf)
                 demand("rates", U[:, i] - before, low, high)
-            for j, obstacle in enumerate(obstacles):
-                n = sides[:, j * N + i]
+            for j in range(len(obstacles)):
+                k = j * N + i
+                n = sides[:, k]
                 if self.dim == 2:
                     n = casadi.vertcat(casadi.cos(n), casadi.sin(n))
                 else:
                     demand("unit", casadi.sumsqr(n), -np.inf, 1.0)
-                spread = casadi.sqrt(casadi.bilin(casadi.DM(obstacle.covariances[i + 1]), n))
-                delta = X[self.position, i] - casadi.DM(obstacle.means[i + 1])
-                reach = problem.robot_radius + obstacle.radius
-                demand("obstacles", casadi.dot(n, delta) - self.size * spread, reach, np.inf)
+                Sigma = spreads[:, k * self.dim : (k + 1) * self.dim]
+                outwards = casadi.dot(n, X[self.position, i] - means[:, k])
+                gap = outwards - self.size * casadi.sqrt(casadi.bilin(Sigma, n)) - reaches[j]
+                demand("obstacles", gap, 0.0, np.inf)
         w = casadi.vertcat(casadi.vec(X), casadi.vec(U), casadi.vec(sides))
-        self.nlp = {"x": w, "f": cost, "g": casadi.vertcat(*rows)}
+        p = casadi.vertcat(*map(casadi.vec, (start, ref, means, spreads, reaches)))
+        self.nlp = {"x": w, "p": p, "f": cost, "g": casadi.vertcat(*rows)}
+        self.compiled: dict[str, casadi.Function] = {}
         self.rows = np.concatenate(lower), np.concatenate(upper)
         free = np.full(sides.numel(), np.inf)
         x_min, x_max = bounds.pop("x_min", -np.inf), bounds.pop("x_max", np.inf)
@@ -113,12 +124,31 @@ class ModelReferee:
             np.concatenate([np.tile(np.broadcast_to(x, self.nx), N), np.tile(u, N), sign * free])
             for x, u, sign in ((x_min, problem.u_min, -1), (x_max, problem.u_max, 1))
         )
+        self._given(x0, x_ref, obstacles)
+
+    def at(self, x0, x_ref, obstacles) -> "ModelReferee":
+        """The same problem at another step, with as many obstacles."""
+        assert len(obstacles) == len(self.obstacles)
+        other = copy(self)
+        other._given(x0, x_ref, obstacles)
+        return other
+
+    def _given(self, x0, x_ref, obstacles) -> None:
+        self.obstacles = obstacles
+        numbers = [x0, x_ref[1:], *(o.means[1:] for o in obstacles)]
+        numbers += [*(o.covariances[1:] for o in obstacles)]  # symmetric
+        numbers += [self.problem.robot_radius + o.radius for o in obstacles]
+        self.p = np.concatenate([np.ravel(number) for number in numbers])
 
     def solve(self, X, U, near: bool) -> Verdict:
         """Run IPOPT from a plan; `near` keeps the barrier small so that it stays close by."""
-        ipopt = _OPTIONS | (_NEAR if near else {})
-        solver = casadi.nlpsol("referee", "ipopt", self.nlp, {"print_time": False, "ipopt": ipopt})
+        which = "near" if near else "far"
+        if which not in self.compiled:
+            options = {"print_time": False, "ipopt": _OPTIONS | (_NEAR if near else {})}
+            self.compiled[which] = casadi.nlpsol("referee", "ipopt", self.nlp, options)
+        solver = self.compiled[which]
         result = solver(
+            p=self.p,
             x0=np.concatenate([X[1:].ravel(), U.ravel(), self._sides(X[1:, self.position])]),
             lbx=self.box[0],
             ubx=self.box[1],
@@ -136,16 +166,19 @@ class ModelReferee:
 
         One point in each interval; rates are not looked at.
         """
-        duals, (x, f, g) = plan.multipliers, (self.nlp[key] for key in "xfg")
-        kinds, y = np.array(self.kinds), casadi.SX.sym("y", g.numel())
-        gradient = casadi.gradient(f + casadi.dot(y, g), x)
-        evaluate = casadi.Function("kkt", [x, y], [gradient, g])
+        duals, kinds = plan.multipliers, np.array(self.kinds)
+        if "kkt" not in self.compiled:
+            x, p, f, g = (self.nlp[key] for key in "xpfg")
+            y = casadi.SX.sym("y", g.numel())
+            gradient = casadi.gradient(f + casadi.dot(y, g), x)
+            self.compiled["kkt"] = casadi.Function("kkt", [x, p, y], [gradient, g])
         values = np.zeros(len(kinds))
         values[kinds == "dynamics"] = duals.dynamics.ravel()
         # The rows go by stage, then by obstacle.
         values[kinds == "obstacles"] = duals.obstacles[: len(self.obstacles)].T.ravel()
         w = np.concatenate([plan.X[1:].ravel(), plan.U.ravel()])
-        slope, rows = evaluate(np.append(w, self._sides(plan.X[1:, self.position])), values)
+        w_all = np.append(w, self._sides(plan.X[1:, self.position]))
+        slope, rows = self.compiled["kkt"](w_all, self.p, values)
         slope, rows, count = np.array(slope).ravel(), np.array(rows).ravel(), len(w)
         forces = np.zeros(count)
         if duals.states.size:
@@ -176,7 +209,7 @@ class ModelReferee:
         delta = (positions - means)[:, :, None]
         n, width = np.ones((*delta.shape[:2], 1, self.dim)), 1e3
         for _ in range(40):
-            tries = n + width * rng.normal(size=(*delta.shape[:2], 400, self.dim))
+            tries = n + width * rng.normal(size=(*delta.shape[:2], 100, self.dim))
             tries[:, :, :1] = n
             tries /= np.linalg.norm(tries, axis=-1, keepdims=True)
             spread = np.sqrt(np.einsum("mnki,mnij,mnkj->mnk", tries, Sigma, tries))
