@@ -55,9 +55,10 @@ def measure(
     problem = scenario.problem("axes", margin)
     mpc, plain, peer = MPC(problem), SCP(problem), Ipopt(problem)
     rng = np.random.default_rng(seed)
-    x, total, gaps = scenario.start(), 0.0, []
+    x, total, gaps, dt = scenario.start(), 0.0, [], problem.model.dt
     for k in range(steps):
-        x_ref, obstacles = scenario.states(k), scenario.predictions(k)
+        x_ref = scenario.x_ref(k * dt)
+        obstacles = scenario.predictions(k * dt, dt, problem.horizon)
         free = plain.solve(x, x_ref)
         guess = mpc.nominal() or free.iterate
         plan = mpc.step(x, x_ref, obstacles)

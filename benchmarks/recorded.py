@@ -3,19 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from scp_mpc.arrays import FloatArray
 from scp_mpc.control.mpc import MPC
-from scp_mpc.models.linear import LinearModel, as_linear
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.solver import SCP
 from scp_mpc.settings import Settings
 from scp_mpc.simulation.crowds import Crowd
-from scp_mpc.simulation.disturbance import Push
 from scp_mpc.simulation.scenarios import Scenario
+from scp_mpc.simulation.simulate import simulate
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,21 +53,11 @@ def record(
     """
     problem = scenario.problem() if problem is None else problem
     mpc = MPC(problem, settings)
-    x, push = scenario.start(), _push(scenario, seed, as_linear("problem.model", problem.model))
-    guess = SCP(problem, settings).solve(x, scenario.states(0)).iterate
-    recorded = []
-    for k in range(steps):
-        x_ref, obstacles = scenario.states(k), tuple(scenario.predictions(k))
-        recorded.append(RecordedStep(x, x_ref, obstacles, guess))
-        plan = mpc.step(x, x_ref, obstacles)
-        x = problem.model.step(x, plan.u0) + push(plan.u0)
-        guess = plan.iterate.shifted(problem.model)
-        advance()
-    return recorded
-
-
-def _push(scenario: Scenario | Crowd, seed: int, model: LinearModel) -> Push:
-    if isinstance(scenario, Crowd) or scenario.disturbance is None:
-        still = np.zeros(model.nx)
-        return lambda _: still
-    return scenario.disturbance.begin(model, scenario.generator(seed))
+    if isinstance(scenario, Crowd):
+        run = simulate(mpc, scenario, steps=steps, advance=advance)
+    else:
+        run = scenario.run(mpc, steps, seed, advance)
+    first = SCP(problem, settings).solve(run.states[0], run.references[0]).iterate
+    guesses = [first, *(plan.iterate.shifted(problem.model) for plan in run.plans[:-1])]
+    given = zip(run.states[:-1], run.references, run.predictions, guesses, strict=True)
+    return [RecordedStep(x, x_ref, tuple(told), guess) for x, x_ref, told, guess in given]

@@ -47,14 +47,11 @@ class Course:
 
     def clearance(self, step: int, path: FloatArray) -> float:
         """Smallest true distance [m] along one interval; path (T, d) at equal fractions of it."""
-        if isinstance(self.world, Circuit):
-            return self.world.clearance(step, path)
-        obstacles = self.world.obstacles if isinstance(self.world, Crowd) else [self.world.obstacle]
-        problem, fractions = self.problem, np.linspace(0.0, 1.0, len(path))
-        times = problem.model.dt * (step + fractions)
+        problem = self.problem
+        times = problem.model.dt * (step + np.linspace(0.0, 1.0, len(path)))
         gaps = [
-            np.linalg.norm(path - np.array([o.position(t) for t in times]), axis=-1) - o.radius
-            for o in obstacles
+            np.linalg.norm(path - np.array([body.at(t) for t in times]), axis=-1) - body.radius
+            for body in self.world.bodies
         ]
         return float(np.min(gaps)) - problem.robot_radius
 

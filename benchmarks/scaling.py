@@ -115,8 +115,7 @@ def figure(found: Sequence[dict[str, Any]], fitted: dict[str, float]) -> Figure:
 
 
 def _steps(world: Scenario | Crowd, steps: int) -> int:
-    count = world.count if isinstance(world, Crowd) else 1
-    return steps if world.horizon * count <= _LARGE else max(steps // 20, 1)
+    return steps if world.horizon * len(world.bodies) <= _LARGE else max(steps // 20, 1)
 
 
 def _row(
@@ -130,7 +129,7 @@ def _row(
     return {
         "world": world.name,
         "horizon": world.horizon,
-        "obstacles": len(world.predictions(0)),
+        "obstacles": len(world.bodies),
         "multi_start": multi_start,
         "steps": steps,
         "active": sum(plan.iterate.touches for plan in plans),

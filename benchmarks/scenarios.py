@@ -10,9 +10,9 @@ from typing import Any
 
 from benchmarks.progress import progress
 from benchmarks.tables import table
-from scp_mpc import Margin
+from scp_mpc import MPC, Margin
 from scp_mpc.report.summary import summarise
-from scp_mpc.simulation import SCENARIOS, simulate
+from scp_mpc.simulation import SCENARIOS
 
 NAME = "scenarios"  # of the files
 STEPS = 600
@@ -39,7 +39,7 @@ def _row(name: str, which: str, steps: int, advance: Callable[[], object]) -> di
     scenario = SCENARIOS[which]
     margin = Margin() if s_min is None else Margin(lower=s_min)
     shape: Any = inflation
-    run = simulate(scenario, scenario.problem(shape, margin), steps=steps, seed=0)
+    run = scenario.run(MPC(scenario.problem(shape, margin)), steps)
     advance()
     return summarise(run) | {"variant": name, "wind": scenario.disturbance is not None}
 

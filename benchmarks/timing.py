@@ -9,25 +9,12 @@ import resource
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter, thread_time
-from typing import Protocol
 
 import numpy as np
 
-from scp_mpc import MPC, ObstaclePrediction, Plan, Problem, Settings
+from scp_mpc import MPC, Plan, Problem, Settings
 from scp_mpc.arrays import FloatArray
-
-
-class World(Protocol):
-    """What a closed loop is run in: a scenario, a crowd, a circuit."""
-
-    def start(self) -> FloatArray:
-        """The robot's state at first (nx,)."""
-
-    def states(self, step: int) -> FloatArray:
-        """The reference (N+1, nx) from a step on."""
-
-    def predictions(self, step: int) -> list[ObstaclePrediction]:
-        """What is predicted at a step."""
+from scp_mpc.simulation import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +37,7 @@ class Timed:
 
 
 def closed_loop(
-    world: World,
+    world: Scene,
     problem: Problem,
     settings: Settings,
     steps: int,
@@ -65,14 +52,14 @@ def closed_loop(
         steps: Control steps.
         advance: Called after each of them, for a progress bar.
     """
-    x = world.start()
-    MPC(problem, settings).step(x, world.states(0), world.predictions(0))
+    x, dt, N = world.start(), problem.model.dt, problem.horizon
+    MPC(problem, settings).step(x, world.x_ref(0.0, x), world.predictions(0.0, dt, N))
     mpc = MPC(problem, settings)
     gc.collect()
     gc.freeze()
     try:
         for k in range(steps):
-            x_ref, obstacles = world.states(k), world.predictions(k)
+            x_ref, obstacles = world.x_ref(k * dt, x), world.predictions(k * dt, dt, N)
             switches, began, worked = _switches(), perf_counter(), thread_time()
             plan = mpc.step(x, x_ref, obstacles)
             thread, wall = thread_time() - worked, perf_counter() - began

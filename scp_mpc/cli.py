@@ -7,12 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
-from scp_mpc import Containment, Margin, ScpMpcError, Settings, __version__
+from scp_mpc import MPC, Containment, Margin, ScpMpcError, Settings, __version__
 from scp_mpc.arrays import as_count
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 from scp_mpc.problem import Problem
 from scp_mpc.report import (
-    COLUMNS,
     coverage_figure,
     coverage_numbers,
     coverage_table,
@@ -20,6 +19,7 @@ from scp_mpc.report import (
     replay_table,
     save,
     summarise_replay,
+    table_cells,
     write_animation,
     write_figures,
     write_replay_animation,
@@ -29,15 +29,14 @@ from scp_mpc.simulation import (
     SCENARIOS,
     STEPS,
     TRACKING,
-    ClosedLoop,
     Crossing,
     Recording,
+    Run,
     control_steps,
     find_meetings,
     measure_coverage,
     read_recording,
     replay_problem,
-    simulate,
 )
 from scp_mpc.simulation import replay as run_replay
 from scp_mpc.tracking import TrackerSettings
@@ -107,15 +106,15 @@ def report(
         if seed < 0:
             raise BoundsError("seed", f"{seed} is negative")
         out.mkdir(parents=True, exist_ok=True)
-        runs = _simulate_all(problems, settings, steps, seed)
-        summary = write_summary(runs, out)
+        runs = _run_all(problems, settings, steps, seed)
+        summary = write_summary(list(runs.values()), out)
         Console(markup=False).print(_table(summary["scenarios"]))
         typer.echo("Drawing ...")
-        figures = write_figures(runs, out)
+        figures = write_figures(list(runs.values()), out)
         written = f"summary.json, summary.md, {len(figures)} figures"
         if animation:
-            run = next(run for run in runs if run.scenario.name == _ANIMATED)
-            written += f", {write_animation(run, out / f'{_ANIMATED}.gif').name}"
+            file = write_animation(runs[_ANIMATED], out / f"{_ANIMATED}.gif")
+            written += f", {file.name}"
         typer.echo(f"Written to {out}: {written}")
 
 
@@ -248,27 +247,27 @@ def _write_json(numbers: dict[str, Any], file: Path) -> None:
     typer.echo(f"Written to {file}")
 
 
-def _simulate_all(
+def _run_all(
     problems: dict[str, Problem], settings: Settings, steps: int, seed: int
-) -> list[ClosedLoop]:
-    runs = []
+) -> dict[str, Run]:
+    runs = {}
     with tqdm(total=steps * len(problems), unit="step") as bar:
         for name, problem in problems.items():
             bar.set_description(name)
-            runs.append(
-                simulate(SCENARIOS[name], problem, settings, steps, seed, advance=bar.update)
-            )
+            mpc = MPC(problem, settings)
+            runs[name] = SCENARIOS[name].run(mpc, steps, seed, advance=bar.update)
     return runs
 
 
 def _table(scenarios: list[dict[str, Any]]) -> Table:
     """The table of the summary, turned so that it fits a terminal: one column per scenario."""
-    name, *quantities = COLUMNS
-    table = Table(name.header, *(name.cell(row) for row in scenarios))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for quantity in quantities:
-        table.add_row(quantity.header, *(quantity.cell(row) for row in scenarios))
+    columns = [table_cells(row) for row in scenarios]
+    name, *headers = columns[0]
+    table = Table(name, *(column[name] for column in columns))
+    for right in table.columns[1:]:
+        right.justify = "right"
+    for header in headers:
+        table.add_row(header, *(column[header] for column in columns))
     return table
 
 

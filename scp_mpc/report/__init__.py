@@ -3,31 +3,31 @@
 from scp_mpc.report.animation import write_animation
 from scp_mpc.report.canvas import save
 from scp_mpc.report.coverage_figure import coverage_figure, coverage_numbers, coverage_table
+from scp_mpc.report.encounters import centre_distances, no_go_clearances
 from scp_mpc.report.exhibits import Exhibit, exhibits
 from scp_mpc.report.figures import FIGURES, write_figures
 from scp_mpc.report.history_figure import history_figure
 from scp_mpc.report.replay_animation import write_replay_animation
 from scp_mpc.report.replay_figure import replay_figure
 from scp_mpc.report.replay_summary import replay_table, summarise_replay
-from scp_mpc.report.summary import summarise, summarise_all, write_summary
-from scp_mpc.report.table import COLUMNS, markdown_table
+from scp_mpc.report.summary import summarise, table_cells, write_summary
 
 __all__ = [
-    "COLUMNS",
     "FIGURES",
     "Exhibit",
+    "centre_distances",
     "coverage_figure",
     "coverage_numbers",
     "coverage_table",
     "exhibits",
     "history_figure",
-    "markdown_table",
+    "no_go_clearances",
     "replay_figure",
     "replay_table",
     "save",
     "summarise",
-    "summarise_all",
     "summarise_replay",
+    "table_cells",
     "write_animation",
     "write_figures",
     "write_replay_animation",

@@ -3,10 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from scp_mpc.arrays import FloatArray
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
 ROBOT = "#0072B2"  # blue
@@ -48,16 +51,17 @@ def as_map(axes: Axes) -> None:
     axes.set_ylabel("y [m]")
 
 
+def show_square(axes: Axes, centre: FloatArray, half_width: float) -> None:
+    """Show what is up to `half_width` from a centre (2,) on either axis [m]."""
+    x, y = np.stack([centre - half_width, centre + half_width], axis=1)
+    axes.set(xlim=x, ylim=y)
+
+
 def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
     """Put one legend of all panels below everything, where it covers no data."""
     entries: dict[str, Artist] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    figure.legend(
-        list(entries.values()),
-        list(entries),
-        loc="outside lower center",
-        ncols=columns,
-        frameon=False,
-    )
+    handles, labels = list(entries.values()), list(entries)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)

@@ -1,72 +1,54 @@
-"""Encounters: when the obstacle comes near, and when it shapes the plan."""
-
-from dataclasses import dataclass
+"""Encounters of a scenario's run: how near the obstacle comes, and when."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scp_mpc.arrays import BoolArray, FloatArray
+from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.geometry.no_go import NoGoSets
-from scp_mpc.simulation.closed_loop import ClosedLoop
+from scp_mpc.simulation.run import Run
+from scp_mpc.simulation.scenarios import Scenario
 
 
-@dataclass(frozen=True)
-class Encounter:
-    """A run of control steps with the robot near the obstacle.
+def scenario_of(run: Run) -> Scenario:
+    """Return the scenario that was run.
 
-    Attributes:
-        first: First control step.
-        closest: Control step with the smallest distance.
-        last: Last control step.
+    Raises:
+        InvalidArgumentError: It was another scene.
     """
+    if not isinstance(run.scene, Scenario):
+        raise InvalidArgumentError("run", f"of a {type(run.scene).__name__}, not of a scenario")
+    return run.scene
 
-    first: int
-    closest: int
-    last: int
+
+def centre_distances(run: Run) -> FloatArray:
+    """Distances (K+1,) between the true centres of robot and obstacle [m]."""
+    return np.linalg.norm(run.positions - run.bodies[:, 0], axis=1)
 
 
-def find_encounters(run: ClosedLoop) -> list[Encounter]:
-    """Return the encounters in order; never none, if need be the step of the smallest distance.
+def no_go_clearances(run: Run) -> FloatArray:
+    """Signed distances (K,) to each step's no-go set at s = s_ref [m], negative inside."""
+    no_go, sets = run.problem.no_go, _sets(run)
+    pairs = zip(sets, run.positions, strict=False)
+    return np.array([no_go.clearance(around, p[None])[0, 0] for around, p in pairs])
 
-    Near is what is closer than the longest semi-axis of the no-go set at s = s_ref.
+
+def find_encounters(run: Run) -> list[int]:
+    """Return the closest step of each encounter; never none, if need be the closest of all.
+
+    In an encounter the robot is closer than the longest semi-axis of the no-go set at s = s_ref.
     """
-    distances = run.distances[: run.steps]
-    near = distances < _reaches(run)
-    spans = spans_of(near)
-    if not spans:
-        closest = int(np.argmin(distances))
-        return [Encounter(closest, closest, closest)]
-    return [
-        Encounter(first, first + int(np.argmin(distances[first : last + 1])), last)
-        for first, last in spans
-    ]
+    distances, s_ref = centre_distances(run)[:-1], run.problem.size.reference
+    reaches = [s_ref * o.deviations.max() + o.radii[0, 0] for o in _sets(run)]
+    near = spans_of(distances < reaches)
+    return [int(k[distances[k].argmin()]) for k in near] or [int(distances.argmin())]
 
 
-def active_steps(run: ClosedLoop) -> BoolArray:
-    """Return at which steps (K,) an obstacle's constraint is active somewhere along the plan."""
-    return np.array(
-        [
-            plan.multipliers is not None
-            and bool((np.abs(plan.multipliers.obstacles) > run.settings.tolerance).any())
-            for plan in run.plans
-        ]
-    )
+def spans_of(marked: BoolArray) -> list[NDArray[np.intp]]:
+    """Return the indices of each run of consecutive True."""
+    k = np.flatnonzero(marked)
+    return [part for part in np.split(k, np.flatnonzero(np.diff(k) > 1) + 1) if len(part)]
 
 
-def slack_steps(run: ClosedLoop) -> BoolArray:
-    """Return at which steps (K,) the plan's largest slack exceeds the solver's tolerance."""
-    return np.array(
-        [plan.slack.max(initial=0.0) > run.settings.tolerance for plan in run.plans], dtype=np.bool_
-    )
-
-
-def spans_of(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return the first and last index of each run of consecutive True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _reaches(run: ClosedLoop) -> FloatArray:
-    """Longest semi-axis (K,) of the no-go sets [m]."""
-    s_ref, radius = run.problem.size.reference, run.problem.robot_radius
-    sets = [NoGoSets.now([prediction], radius) for prediction in run.predictions]
-    return np.array([s_ref * o.deviations.max() + o.radii[0, 0] for o in sets])
+def _sets(run: Run) -> list[NoGoSets]:
+    return [NoGoSets.now(told, run.problem.robot_radius) for told in run.predictions]

@@ -1,7 +1,5 @@
 """The SCP iterations of one control step: where the plans went, and how the numbers fell."""
 
-from itertools import count
-
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -25,7 +23,7 @@ from scp_mpc.report.canvas import (
     new_figure,
     tidy,
 )
-from scp_mpc.report.outline import outline
+from scp_mpc.report.outline import half_plane_strips, outline
 from scp_mpc.scp.history import Record
 from scp_mpc.scp.plan import Plan
 from scp_mpc.settings import Settings
@@ -57,32 +55,28 @@ def history_figure(plan: Plan, tolerance: float = Settings.tolerance) -> Figure:
         f"{len(plan.history)} SCP iterations, N = {plan.step.problem.horizon}: "
         f"{plan.status.name.lower()}, cost {plan.cost:.3g}, KKT residual {plan.kkt.worst:.0e}"
     )
-    grid = figure.add_gridspec(5, 2, width_ratios=(1.5, 1.0))
-    plane = figure.add_subplot(grid[:, 0])
-    first = figure.add_subplot(grid[0, 1])
-    rest = [figure.add_subplot(grid[row, 1], sharex=first) for row in range(1, 5)]
-    colors = _colors(len(plan.history))
+    mosaic = figure.subplot_mosaic("P1;P2;P3;P4;P5", width_ratios=(1.5, 1.0))
+    plane, *panels = mosaic.values()
+    # Light to dark, also without colour vision.
+    colors = np.asarray(colormaps["cividis"](np.linspace(0.85, 0.0, len(plan.history))))
     _draw_plane(plane, plan, colors)
-    _draw_numbers([first, *rest], plan.history, colors, tolerance)
-    legend_below(figure, (plane, first, *rest), columns=4)
+    _draw_numbers(panels, plan.history, colors, tolerance)
+    legend_below(figure, (plane, *panels), columns=4)
     return figure
-
-
-def _colors(number: int) -> FloatArray:
-    """Light to dark, also without colour vision."""
-    return np.asarray(colormaps["cividis"](np.linspace(0.85, 0.0, number)))
 
 
 def _draw_plane(axes: Axes, plan: Plan, colors: FloatArray) -> None:
     as_map(axes)
-    step, history = plan.step, plan.history
-    axes.plot(
-        *step.x_ref[:, step.problem.model.position].T, "+", color=REFERENCE, label="reference"
-    )
-    for k, record, color in zip(count(1), history, colors, strict=False):
+    step, history, d = plan.step, plan.history, plan.step.problem.model.dim
+    asked = step.x_ref[:, step.problem.model.position]
+    axes.plot(*asked.T, "+", color=REFERENCE, label="reference")
+    here = step.nodes.now(step.x0)
+    for k, (record, color) in enumerate(zip(history, colors, strict=True), 1):
         last = k == len(history)
+        # Of a longer robot, the middle of its discs.
+        nodes = record.positions[1:].reshape(-1, step.nodes.discs, d)
         axes.plot(
-            *_centres(plan, record).T,
+            *np.concatenate([here[None], nodes]).mean(axis=1).T,
             linestyle="-" if record.accepted else ":",
             color=color,
             marker="." if last else None,
@@ -90,22 +84,12 @@ def _draw_plane(axes: Axes, plan: Plan, colors: FloatArray) -> None:
             zorder=3,
             label=f"plan of iteration {k}" if last or k == 1 else None,
         )
-    for index, centre in enumerate(step.nodes.now(step.x0)):
-        label = None if index else "robot now"
-        disc = Circle(
-            tuple(centre), step.problem.robot_radius, color=ROBOT, alpha=0.6, zorder=4, label=label
-        )
-        axes.add_patch(disc)
+    radius, blue = step.problem.robot_radius, {"color": ROBOT, "alpha": 0.6, "zorder": 4}
+    for centre in here:
+        axes.add_patch(Circle(tuple(centre), radius, **blue, label="robot now"))
     _draw_obstacles(axes, plan)
     _draw_half_planes(axes, history)
     axes.set_title("In the plane", fontsize=11)
-
-
-def _centres(plan: Plan, record: Record) -> FloatArray:
-    """The plan's way: of a longer robot, the middle of its discs."""
-    d, here = plan.step.problem.model.dim, plan.step.nodes.now(plan.step.x0)
-    nodes = record.positions[1:].reshape(-1, plan.step.nodes.discs, d)
-    return np.concatenate([here[None], nodes]).mean(axis=1)
 
 
 def _draw_obstacles(axes: Axes, plan: Plan) -> None:
@@ -121,24 +105,13 @@ def _draw_obstacles(axes: Axes, plan: Plan) -> None:
             step.means[j, nodes + 1], step.covariances[j, nodes + 1], step.radii[j, nodes]
         )
         inflation, s = step.problem.inflation, float(iterate.s[j])
-        edges = [outline(sets, (k, 0), s, inflation, obstacle.shape) for k in range(len(nodes))]
-        body = PolyCollection(
-            edges,
-            facecolor=(*to_rgb(OBSTACLE), 0.08),
-            edgecolor=OBSTACLE,
-            label=None if j else "no-go set where it pushes",
-        )
+        edges = [outline(sets, k, s, inflation, obstacle.shape) for k in range(len(nodes))]
+        pale = (*to_rgb(OBSTACLE), 0.08)
+        body = PolyCollection(edges, facecolor=pale, edgecolor=OBSTACLE)
+        body.set_label("no-go set where it pushes")
         axes.add_collection(body)
-        axes.plot(
-            *step.means[j].T,
-            "--",
-            color=OBSTACLE,
-            marker="o",
-            markevery=[0],
-            linewidth=1.0,
-            markersize=4,
-            label=None if j else "obstacle, now and expected",
-        )
+        (way,) = axes.plot(*step.means[j].T, "--o", color=OBSTACLE, linewidth=1.0, markersize=4)
+        way.set(markevery=[0], label="obstacle, now and expected")
     axes.autoscale_view()
 
 
@@ -148,16 +121,12 @@ def _draw_half_planes(axes: Axes, history: tuple[Record, ...]) -> None:
     if not len(last.normals):
         return
     extent = float(np.ptp(last.positions, axis=0).max())
-    length = np.linalg.norm(last.normals, axis=1, keepdims=True)
-    n = last.normals / length
-    feet = last.points - last.values[:, None] / length * n
-    along = _EDGE * extent * np.stack([-n[:, 1], n[:, 0]], axis=1)
-    edges = np.stack([feet - along, feet + along], axis=1)
-    strips = np.concatenate([edges, edges[:, ::-1] - _DEPTH * extent * n[:, None]], axis=1)
+    size = _EDGE * extent, _DEPTH * extent
+    strips = half_plane_strips(last.points, last.normals, last.values, *size)
     axes.add_collection(PolyCollection(list(strips), facecolor=HALF_PLANE, alpha=0.3))
-    for index, edge in enumerate(edges):
-        label = None if index else "active half-plane of the last iteration"
-        axes.plot(*edge.T, color=HALF_PLANE, linewidth=1.8, zorder=4, label=label)
+    label = "active half-plane of the last iteration"
+    for strip in strips:
+        axes.plot(*strip[:2].T, color=HALF_PLANE, linewidth=1.8, zorder=4, label=label)
 
 
 def _draw_numbers(
@@ -165,43 +134,36 @@ def _draw_numbers(
 ) -> None:
     k = np.arange(1, len(history) + 1)
     accepted = np.array([record.accepted for record in history])
-    cost, violation, residual, change, admm = np.array(
-        [[r.cost, r.violation, r.residual, r.step, r.iterations] for r in history]
-    ).T
+    label = "" if accepted.all() else "rejected (plan dotted)"
+    rows = [[r.cost, r.violation, r.residual, r.step, r.iterations] for r in history]
+    *values, admm = np.array(rows).T
+    names = ("cost", "violation\n[m]", "KKT\nresidual", "change of\ninputs")
     costs, violations, residuals, changes, bars = panels
-    for axes, values in zip(panels[:4], (cost, violation, residual, change), strict=True):
-        axes.plot(k, values, color=REFERENCE, linewidth=1.0, zorder=1)
-        axes.scatter(k[accepted], values[accepted], c=colors[accepted], zorder=3, clip_on=False)
-        axes.scatter(
-            k[~accepted],
-            values[~accepted],
-            facecolors="white",
-            edgecolors=colors[~accepted],
-            zorder=3,
-            clip_on=False,
-            label=None if accepted.all() else "rejected (plan dotted)",
-        )
+    for axes, name, y in zip(panels, names, values, strict=False):
+        axes.plot(k, y, color=REFERENCE, linewidth=1.0, zorder=1)
+        axes.scatter(k[accepted], y[accepted], c=colors[accepted], zorder=3, clip_on=False)
+        hollow = axes.scatter(k[~accepted], y[~accepted], zorder=3, clip_on=False, label=label)
+        hollow.set(facecolor="white", edgecolor=colors[~accepted])
+        axes.set_ylabel(name)
+        axes.margins(y=0.15)
     costs.set_title("Number by number", fontsize=11)
-    costs.set_ylabel("cost")
+    cost, violation, *_ = values
     if cost.min() > 0 and cost.max() > _SPAN * cost.min():
         costs.set_yscale("log")
     else:
         costs.ticklabel_format(useOffset=False)
-    violations.set_ylabel("violation\n[m]")
     violations.set_ylim(0.0, 1.15 * max(float(violation.max()), _VISIBLE))
-    residuals.set_ylabel("KKT\nresidual")
     residuals.set_yscale("log")
     residuals.axhline(tolerance, color=LIMIT, linestyle="--", linewidth=1.0, label="tolerance")
-    changes.set_ylabel("change of\ninputs")
     changes.set_yscale("log")
     bars.bar(k, admm, color=colors, width=0.6)
     bars.set_ylabel("ADMM\niterations")
     bars.set_xlabel("SCP iteration")
     bars.xaxis.set_major_locator(MaxNLocator(integer=True))
     bars.set_xlim(0.4, len(history) + 0.6)
-    for axes in (costs, residuals, changes):
-        axes.margins(y=0.15)
+    for axes in panels[:-1]:
+        axes.sharex(bars)
+        axes.tick_params(labelbottom=False)
     for axes in panels:
         tidy(axes)
-        axes.tick_params(labelbottom=axes is bars)
-    panels[0].figure.align_ylabels(panels)
+    bars.figure.align_ylabels(panels)

@@ -1,4 +1,4 @@
-"""The boundary of a no-go set in the plane, as a polygon to be drawn.
+"""No-go sets and half-planes in the plane, as polygons to be drawn.
 
 Notation, in the frame of the ellipse's axes:
     sigma   (2,)    standard deviations [m]
@@ -27,20 +27,15 @@ def no_go_outline(
     """
     if prediction.dim != 2:
         raise ValueError(f"a prediction in {prediction.dim} dimensions has no outline in the plane")
-    if stage == 0:
-        sets = NoGoSets.now([prediction], problem.robot_radius)
-    else:
-        sets = NoGoSets.from_predictions(
-            [prediction], problem.robot_radius, 1, prediction.horizon, 2
-        )
-    at = max(stage - 1, 0)
-    return outline(sets, (0, at), s, problem.inflation, prediction.shape)
+    means, Sigma = prediction.means[[stage]], prediction.covariances[[stage]]
+    sets = NoGoSets.pairs(means, Sigma, np.array([prediction.radius + problem.robot_radius]))
+    return outline(sets, 0, s, problem.inflation, prediction.shape)
 
 
 def outline(
-    sets: NoGoSets, at: tuple[int, int], s: float, inflation: str, shape: Solid | None = None
+    sets: NoGoSets, slot: int, s: float, inflation: str, shape: Solid | None = None
 ) -> FloatArray:
-    """Return a closed polygon (K, 2) [m] around one of the sets, `at` (slot, stage).
+    """Return a closed polygon (K, 2) [m] around the set in a slot, at its first stage.
 
     With the exact inflation, the boundary of ellipse (+) disc is sampled by its normals,
 
@@ -50,7 +45,7 @@ def outline(
     the corner that lies farthest along n, plus (s sigma_max + r) n.
     """
     mean, rotation, sigma, r = (
-        part[at] for part in (sets.means, sets.rotations, sets.deviations, sets.radii)
+        part[slot, 0] for part in (sets.means, sets.rotations, sets.deviations, sets.radii)
     )
     angle = np.linspace(0.0, 2 * np.pi, _POINTS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -61,3 +56,25 @@ def outline(
         return mean + ((s * sigma + r) * n) @ rotation.T
     support = np.maximum(np.linalg.norm(sigma * n, axis=-1, keepdims=True), 1e-300)
     return mean + (s * sigma**2 * n / support + r * n) @ rotation.T
+
+
+def half_plane_strips(
+    points: FloatArray, normals: FloatArray, values: FloatArray, half_length: float, depth: float
+) -> FloatArray:
+    """Return the strips (n, 4, 2) [m] along the edges of the half-planes n'(x - p) + v >= 0.
+
+    Two corners on the edge, about the foot of the point, then two on the forbidden side.
+
+    Args:
+        points: p, (n, 2) [m].
+        normals: n, (n, 2).
+        values: v, (n,).
+        half_length: Of each edge [m].
+        depth: Of each strip [m].
+    """
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    n = normals / length
+    feet = points - values[:, None] / length * n
+    along = half_length * np.stack([-n[:, 1], n[:, 0]], axis=1)
+    edges = np.stack([feet - along, feet + along], axis=1)
+    return np.concatenate([edges, edges[:, ::-1] - depth * n[:, None]], axis=1)

@@ -1,10 +1,5 @@
 """Simulation: scenarios, closed loops, wind, obstacles drawn from predictions, recorded crowds."""
 
-from scp_mpc.simulation.closed_loop import (
-    ClosedLoop,
-    Controller,
-    simulate,
-)
 from scp_mpc.simulation.contact import (
     contacts,
     robot_path,
@@ -67,6 +62,7 @@ from scp_mpc.simulation.scenarios import (
 )
 from scp_mpc.simulation.scene import Body, Scene
 from scp_mpc.simulation.sensor import PerfectSensor, Sensor, TrackedSensor
+from scp_mpc.simulation.simulate import Controller, simulate
 
 __all__ = [
     "COUPLINGS",
@@ -77,7 +73,6 @@ __all__ = [
     "TRACKING",
     "ActuatorLag",
     "Body",
-    "ClosedLoop",
     "ConstantPush",
     "Contact",
     "Controller",

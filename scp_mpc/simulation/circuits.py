@@ -17,8 +17,8 @@ from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.models.planar_quadrotor import PlanarQuadrotor
 from scp_mpc.models.quadrotor import Quadrotor
 from scp_mpc.models.unicycle import Unicycle
-from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
+from scp_mpc.simulation.scene import Body, Scene
 
 _R, _OMEGA = 8.0, 0.52  # the report's reference
 _BODY = 0.15  # [m] radius of the robot
@@ -73,8 +73,31 @@ _ROBOTS = {
 CIRCLING = tuple(_ROBOTS)
 
 
+def _circle(angle: FloatArray | float, offset: FloatArray) -> FloatArray:
+    """Points (..., d) at angles (...) off the circle by (d,) [m], first outwards, last up."""
+    radius = _R + offset[0]
+    p = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    if len(offset) == 2:
+        return p
+    height = np.sin(_TILT) * p[..., 1:] + offset[2]
+    return np.concatenate([p[..., :1], np.cos(_TILT) * p[..., 1:], height], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Of one obstacle: offset (d,) of its track, angle at time 0 and angular velocity."""
+
+    offset: FloatArray
+    angle: float
+    speed: float
+
+    def at(self, time: float) -> FloatArray:
+        """Position (d,) [m] at a time [s]."""
+        return _circle(self.angle + self.speed * time, self.offset)
+
+
 @dataclass(frozen=True)
-class Circuit:
+class Circuit(Scene):
     """A robot that follows the report's circle among obstacles.
 
     In space the circle is tilted, the obstacles' tracks are drawn about it, and their covariances
@@ -106,53 +129,37 @@ class Circuit:
 
     def start(self) -> FloatArray:
         """State (nx,) on the reference at time 0."""
-        return self.states(0)[0]
+        return self.x_ref(0.0)[0]
 
-    def states(self, step: int) -> FloatArray:
-        """Reference (N+1, nx) from a step on; robots that fly are to keep upright."""
+    def x_ref(self, time: float, x: FloatArray | None = None) -> FloatArray:  # noqa: ARG002
+        """Reference (N+1, nx) from a time on; robots that fly are to keep upright."""
         model = self.problem.model
-        t: FloatArray = model.dt * (step + np.arange(self.horizon + 1, dtype=np.float64))
-        p, speed = self._circle(_OMEGA * t, np.zeros(model.dim)), _R * _OMEGA
-        v = _OMEGA * self._circle(_OMEGA * t + np.pi / 2, np.zeros(model.dim))
+        t: FloatArray = time + model.dt * np.arange(self.horizon + 1, dtype=np.float64)
+        p, speed = _circle(_OMEGA * t, np.zeros(model.dim)), _R * _OMEGA
+        v = _OMEGA * _circle(_OMEGA * t + np.pi / 2, np.zeros(model.dim))
         if isinstance(model, DoubleIntegrator):
             return model.state(p, v)
-        x = np.zeros((self.horizon + 1, model.nx))
-        x[:, model.position] = p
+        x_ref = np.zeros((self.horizon + 1, model.nx))
+        x_ref[:, model.position] = p
         if model.heading is None:
-            x[:, 3 : 3 + model.dim] = v
+            x_ref[:, 3 : 3 + model.dim] = v
         else:
-            x[:, 2], x[:, 3] = _OMEGA * t + np.pi / 2, speed
+            x_ref[:, 2], x_ref[:, 3] = _OMEGA * t + np.pi / 2, speed
         if self.robot == "bicycle":
-            x[:, 4] = np.arctan(_WHEELBASE / _R)
-        return x
+            x_ref[:, 4] = np.arctan(_WHEELBASE / _R)
+        return x_ref
 
-    def positions(self, times: FloatArray) -> FloatArray:
-        """True positions (M, T, d) of the obstacles at times (T,) [s]."""
-        j = np.arange(self.count)
-        speeds = (-1.0) ** j * np.array(_SPEEDS)[j % len(_SPEEDS)]
-        a = 2 * np.pi * (j + 0.5)[:, None] / self.count + speeds[:, None] * times
-        return self._circle(np.asarray(a, dtype=np.float64), self._drawn[0][:, None])
-
-    def predictions(self, step: int) -> list[ObstaclePrediction]:
-        """Each obstacle's true future, with covariances that grow along the horizon."""
-        t: FloatArray = self.problem.model.dt * np.arange(self.horizon + 1, dtype=np.float64)
-        means = self.positions(step * self.problem.model.dt + t)
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The obstacles, whose covariances grow along the horizon."""
+        t = self.problem.model.dt * np.arange(self.horizon + 1)
         growth = (1.0 + 0.2 * t)[:, None, None]
-        return [
-            ObstaclePrediction(mean, growth * Sigma, _RADIUS)
-            for mean, Sigma in zip(means, self._drawn[1], strict=True)
-        ]
-
-    def clearance(self, step: int, path: FloatArray) -> float:
-        """Smallest true distance [m] of robot and obstacles along one interval.
-
-        Args:
-            step: The interval's number.
-            path: (T, d) robot at equal fractions of it, both ends included.
-        """
-        times = self.problem.model.dt * (step + np.linspace(0.0, 1.0, len(path)))
-        distances = np.linalg.norm(path - self.positions(times), axis=-1)
-        return float(distances.min()) - _BODY - _RADIUS
+        found = []
+        for j, (offset, Sigma) in enumerate(zip(*self._drawn, strict=True)):
+            speed = (-1.0) ** j * _SPEEDS[j % len(_SPEEDS)]
+            way = _Way(offset, 2 * np.pi * (j + 0.5) / self.count, speed)
+            found.append(Body(way.at, _RADIUS, covariances=growth * Sigma))
+        return tuple(found)
 
     @cached_property
     def _drawn(self) -> tuple[FloatArray, FloatArray]:
@@ -166,12 +173,3 @@ class Circuit:
         V = np.linalg.qr(rng.normal(size=(self.count, 3, 3)))[0]
         variances = rng.uniform(0.005, 0.03, (self.count, 1, 3))
         return offsets, (V * variances) @ V.mT
-
-    def _circle(self, a: FloatArray, offset: FloatArray) -> FloatArray:
-        """Points (..., d) at angles (...), the first entry of the offset outwards, the last up."""
-        radius = _R + offset[..., 0]
-        p = np.stack([radius * np.cos(a), radius * np.sin(a)], axis=-1)
-        if offset.shape[-1] == 2:
-            return p
-        height = np.sin(_TILT) * p[..., 1:] + offset[..., 2:]
-        return np.concatenate([p[..., :1], np.cos(_TILT) * p[..., 1:], height], axis=-1)

@@ -1,6 +1,7 @@
 """Several obstacles on and beside the reference circle: named problems for benchmarks and tests."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -9,9 +10,9 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.control.reference import CircularReference
 from scp_mpc.geometry.margin import MarginSpec
 from scp_mpc.obstacles.circular import CircularObstacle
-from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.simulation.scenarios import DT, Scenario
+from scp_mpc.simulation.scene import Body, Scene
 
 _TRACKS = (8.0, 6.6, 9.4, 5.2, 10.8)  # [m] on the reference circle, inside it, outside it
 _SPEEDS = (0.06, 0.10, 0.14, 0.18)  # [rad/s], every other obstacle clockwise
@@ -20,7 +21,7 @@ _GROWTH = 0.004  # [m^2/s] along the horizon
 
 
 @dataclass(frozen=True)
-class Crowd:
+class Crowd(Scene):
     """The report's robot and reference among obstacles that go round both ways.
 
     Attributes:
@@ -63,19 +64,15 @@ class Crowd:
 
     def start(self) -> FloatArray:
         """State (4,) on the reference at time 0."""
-        return self.states(0)[0]
+        return self.x_ref(0.0)[0]
 
-    def states(self, step: int) -> FloatArray:
-        """Reference (N+1, 4) from a step on."""
-        return self.reference.states(step * DT, self.horizon, DT)
-
-    def predictions(self, step: int) -> list[ObstaclePrediction]:
-        """Each obstacle's true future, with a variance that grows along the horizon."""
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The obstacles, whose variance grows along the horizon."""
         times = DT * np.arange(self.horizon + 1)
         covariances = (_VARIANCE + _GROWTH * times)[:, None, None] * np.eye(2)
-        return [
-            ObstaclePrediction(
-                np.array([o.position(step * DT + t) for t in times]), covariances, o.radius
-            )
-            for o in self.obstacles
-        ]
+        return tuple(Body(o.position, o.radius, covariances=covariances) for o in self.obstacles)
+
+    def x_ref(self, time: float, x: FloatArray | None = None) -> FloatArray:  # noqa: ARG002
+        """Reference (N+1, 4) from a time on, wherever the robot is."""
+        return self.reference.states(time, self.horizon, DT)

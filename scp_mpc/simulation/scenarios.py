@@ -1,11 +1,14 @@
-"""The report's four scenarios as named, seeded data that everything else shares."""
+"""The report's four scenarios as named, seeded scenes that everything else shares."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.control.mpc import MPC
 from scp_mpc.control.reference import CircularReference
 from scp_mpc.geometry.margin import MarginSpec
 from scp_mpc.models.double_integrator import DoubleIntegrator
@@ -14,13 +17,17 @@ from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import Predictor, ReportPredictor
 from scp_mpc.problem import Problem
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance, Disturbance
+from scp_mpc.simulation.plant import ModelPlant
+from scp_mpc.simulation.run import Run
+from scp_mpc.simulation.scene import Body, Scene
+from scp_mpc.simulation.simulate import Controller, simulate
 
 DT = 0.2  # [s]
 STEPS = 600  # 120 s
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Scene):
     """One experiment: who moves how, over which horizon, and what disturbs the robot.
 
     Attributes:
@@ -64,21 +71,41 @@ class Scenario:
 
     def start(self) -> FloatArray:
         """State (4,) on the reference at time 0: [8, 0, 0, 4.16]."""
-        return self.states(0)[0]
+        return self.x_ref(0.0)[0]
 
-    def states(self, step: int) -> FloatArray:
-        """Reference (N+1, 4) from a step on."""
-        return self.reference.states(step * DT, self.horizon, DT)
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The obstacle."""
+        return (Body(self.obstacle.position, self.obstacle.radius),)
 
-    def prediction(self, step: int) -> ObstaclePrediction:
-        """What the controller is told about the obstacle at a step."""
-        time = step * DT
-        position, velocity = self.obstacle.position(time), self.obstacle.velocity(time)
-        return self.predictor.predict(position, velocity, self.obstacle.radius, self.horizon, DT)
+    def x_ref(self, time: float, x: FloatArray | None = None) -> FloatArray:  # noqa: ARG002
+        """Reference (N+1, 4) from a time on, wherever the robot is."""
+        return self.reference.states(time, self.horizon, DT)
 
-    def predictions(self, step: int) -> list[ObstaclePrediction]:
-        """The same, as what `MPC.step` takes."""
-        return [self.prediction(step)]
+    def predictions(self, time: float, dt: float, horizon: int) -> list[ObstaclePrediction]:
+        """What the predictor makes of the obstacle's position and velocity at a time."""
+        o = self.obstacle
+        return [self.predictor.predict(o.position(time), o.velocity(time), o.radius, horizon, dt)]
+
+    def run(
+        self,
+        controller: Controller | None = None,
+        steps: int = STEPS,
+        seed: int = 0,
+        advance: Callable[[], object] = lambda: None,
+    ) -> Run:
+        """Run the closed loop of III.F; the same seed gives the same states, bit for bit.
+
+        Args:
+            controller: What plans; `MPC(self.problem())` if None.
+            steps: Number of control steps K.
+            seed: Seed of the disturbance.
+            advance: Called after each step, for a progress bar.
+        """
+        controller = MPC(self.problem()) if controller is None else controller
+        plant, rng = ModelPlant(controller.problem.model, self.disturbance), self.generator(seed)
+        run = simulate(controller, self, plant=plant, steps=steps, seed=rng, advance=advance)
+        return replace(run, seed=seed)
 
     def generator(self, seed: int) -> np.random.Generator:
         """A generator of its own for each scenario, so that none depends on the others' order."""

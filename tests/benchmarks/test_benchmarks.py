@@ -33,15 +33,15 @@ def test_staged_solvers_refuse_what_they_cannot_solve():
 
 def test_crowds_go_both_ways_with_a_size_each():
     crowd = Crowd(30, 12)
-    predictions = crowd.predictions(3)
+    predictions = crowd.predictions(0.6, 0.2, 30)
     assert len(predictions) == 12
     speeds = np.sign([o.angular_velocity for o in crowd.obstacles])
     assert set(speeds) == {-1.0, 1.0}
     spread = predictions[0].largest_std
     assert (np.diff(spread) > 0).all()
-    plan = MPC(crowd.problem()).step(crowd.start(), crowd.states(0), predictions)
+    plan = MPC(crowd.problem()).step(crowd.start(), crowd.x_ref(0.0), predictions)
     assert plan.s.shape == (12,)
-    long = Crowd(200, 2).predictions(0)[0]
+    long = Crowd(200, 2).predictions(0.0, 0.2, 200)[0]
     np.testing.assert_allclose(long.means[200], Crowd(200, 2).obstacles[0].position(40.0))
 
 

@@ -19,7 +19,8 @@ from scp_mpc import (
 from scp_mpc.control import DisturbanceEstimator, Regulator, WindAwareMPC, disturbed
 from scp_mpc.control.position_covariance import PositionCovariance
 from scp_mpc.models import Disturbed
-from scp_mpc.simulation import SCENARIOS, ConstantPush, simulate
+from scp_mpc.report import centre_distances
+from scp_mpc.simulation import SCENARIOS, ConstantPush
 
 VELOCITIES = [1, 3]
 
@@ -90,16 +91,14 @@ def test_without_a_disturbance_nothing_changes(kind):
         x = case.problem.model.step(x, theirs.u0)
 
 
-def controller_of(problem_, settings):
-    return aware(problem_, settings, affects=VELOCITIES)
-
-
 def test_wind_is_rejected_where_nothing_is_in_the_way():
     """Half of the usual error at most, with the short horizon; the same seed, the same bits."""
     alone = replace(SCENARIOS["scenario-4"].obstacle, track_radius=1e3)
     scenario = replace(SCENARIOS["scenario-4"], horizon=8, obstacle=alone)
-    nominal = simulate(scenario, steps=120, seed=1)
-    runs = [simulate(scenario, steps=120, seed=1, controller=controller_of) for _ in range(2)]
+    nominal, *runs = (
+        scenario.run(controller, steps=120, seed=1)
+        for controller in (None, *(aware(scenario.problem(), affects=VELOCITIES) for _ in range(2)))
+    )
     np.testing.assert_array_equal(runs[0].states, runs[1].states)
     np.testing.assert_array_equal(runs[0].inputs, runs[1].inputs)
     assert np.median(runs[0].tracking_errors) < 0.5 * np.median(nominal.tracking_errors)
@@ -108,8 +107,8 @@ def test_wind_is_rejected_where_nothing_is_in_the_way():
 
 def test_scenario_2_is_as_before_with_rejection_on():
     scenario = SCENARIOS["scenario-2"]
-    plain = simulate(scenario, steps=25)
-    other = simulate(scenario, steps=25, controller=controller_of)
+    plain = scenario.run(steps=25)
+    other = scenario.run(aware(scenario.problem(), affects=VELOCITIES), steps=25)
     np.testing.assert_allclose(other.states, plain.states, atol=1e-5)
     assert plain.tracking_errors.max() > 0.2
 
@@ -117,11 +116,11 @@ def test_scenario_2_is_as_before_with_rejection_on():
 def test_a_constant_push_among_obstacles():
     scenario = replace(SCENARIOS["scenario-2"], disturbance=ConstantPush((0.4, 0.4)))
     nominal, other = (
-        simulate(scenario, steps=50, controller=c)
-        for c in (MPC, lambda p, s: aware(p, s, alpha=0.98))
+        scenario.run(controller, steps=50)
+        for controller in (None, aware(scenario.problem(), alpha=0.98))
     )
     assert np.median(other.tracking_errors) < 0.5 * np.median(nominal.tracking_errors)
-    assert other.distances.min() > 0.35
+    assert centre_distances(other).min() > 0.35
 
 
 def spread_of(prediction, horizon=30, terminal_input_weight=1.0, measurement=None, std=0.08):

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import scp_mpc.cli
 from scp_mpc import __version__
-from scp_mpc.report import COLUMNS, FIGURES
+from scp_mpc.report import FIGURES
 
 SCENARIO_NAMES = ["scenario-1", "scenario-2", "scenario-3", "scenario-4"]
 
@@ -104,8 +104,3 @@ def test_without_its_extra_the_command_line_says_what_to_install(package, monkey
     monkeypatch.delitem(sys.modules, "scp_mpc.cli")
     with pytest.raises(SystemExit, match="the extra 'cli'"):
         importlib.import_module("scp_mpc.cli")
-
-
-def test_every_column_has_a_header_of_its_own():
-    headers = [column.header for column in COLUMNS]
-    assert len(set(headers)) == len(headers)

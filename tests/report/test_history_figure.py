@@ -28,8 +28,8 @@ KEPT = Settings(history=True)
 def planned(nodes=1, settings=KEPT, obstacle=None):
     scenario = SCENARIOS["scenario-1"]
     problem = scenario.problem("exact", nodes_per_interval=nodes)
-    x_ref = scenario.states(2)
-    obstacles = scenario.predictions(2) if obstacle is None else [obstacle]
+    x_ref = scenario.x_ref(0.4)
+    obstacles = scenario.predictions(0.4, 0.2, 30) if obstacle is None else [obstacle]
     return SCP(problem, settings).solve(x_ref[0], x_ref, obstacles)
 
 

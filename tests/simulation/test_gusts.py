@@ -10,7 +10,6 @@ from scp_mpc.simulation import (
     ConstantPush,
     CorrelatedDisturbance,
     DrydenGust,
-    simulate,
 )
 
 
@@ -113,7 +112,7 @@ def test_runs_are_independent_and_reproducible(disturbance):
 
 def test_the_closed_loop_adds_what_the_disturbance_says():
     scenario = SCENARIOS["scenario-3"]
-    run = simulate(scenario, steps=6, seed=4)
+    run = scenario.run(steps=6, seed=4)
     model, wind = run.problem.model, scenario.disturbance.samples(scenario.generator(4))
     for x, u, after in zip(run.states, run.inputs, run.states[1:], strict=False):
         np.testing.assert_array_equal(after, model.step(x, u) + next(wind))

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from scp_mpc import CircularReference, Status
-from scp_mpc.simulation import SCENARIOS, CorrelatedDisturbance, simulate
+from scp_mpc import MPC, CircularReference, Status
+from scp_mpc.report import centre_distances, no_go_clearances
+from scp_mpc.simulation import SCENARIOS, CorrelatedDisturbance
 
 
 def test_the_four_scenarios_are_the_reports():
@@ -46,7 +47,8 @@ def test_disturbance_has_the_reports_correlation():
 
 def test_same_seed_same_bits_and_another_seed_another_wind():
     scenario = SCENARIOS["scenario-3"]
-    runs = [simulate(scenario, steps=40, seed=seed) for seed in (1, 1, 2)]
+    runs = [scenario.run(steps=40, seed=seed) for seed in (1, 1, 2)]
+    assert [run.seed for run in runs] == [1, 1, 2]
     np.testing.assert_array_equal(runs[0].states, runs[1].states)
     np.testing.assert_array_equal(runs[0].inputs, runs[1].inputs)
     assert np.abs(runs[0].states - runs[2].states).max() > 0.01
@@ -57,24 +59,27 @@ def test_the_robot_passes_the_obstacle(inflation):
     """Scenario 2 over the first encounter: certified at every step, clear of the no-go set."""
     scenario = SCENARIOS["scenario-2"]
     ticks = []
-    run = simulate(scenario, scenario.problem(inflation), steps=60, advance=lambda: ticks.append(1))
+    mpc = MPC(scenario.problem(inflation))
+    run = scenario.run(mpc, steps=60, advance=lambda: ticks.append(1))
     assert len(ticks) == run.steps == 60
     assert {plan.status for plan in run.plans} == {Status.CONVERGED}
+    assert run.scene is scenario
+    assert no_go_clearances(run).min() > 0
+    assert centre_distances(run).min() > 0.35
     assert run.clearances.min() > 0
-    assert run.distances.min() > 0.35
     assert run.tracking_errors.max() > 0.2  # it did have to give way
     assert run.tracking_errors[5] < 0.1
     assert run.states.shape == (61, 4)
     np.testing.assert_allclose(run.times[-1], 12.0)
     for k in (0, 17, 59):
-        np.testing.assert_array_equal(run.predictions[k].means[0], run.obstacle[k])
+        np.testing.assert_array_equal(run.predictions[k][0].means[0], run.bodies[k, 0])
         np.testing.assert_array_equal(run.plans[k].X[0], run.states[k])
-        np.testing.assert_allclose(run.obstacle[k], scenario.obstacle.position(0.2 * k))
+        np.testing.assert_allclose(run.bodies[k, 0], scenario.obstacle.position(0.2 * k))
 
 
 def test_long_horizon_passes_rather_than_trails():
     """Keeping to one side trails behind the obstacle for seconds; passing does not."""
-    run = simulate(SCENARIOS["scenario-1"], steps=60)
+    run = SCENARIOS["scenario-1"].run(steps=60)
     assert {plan.status for plan in run.plans} == {Status.CONVERGED}
     assert run.tracking_errors.max() < 5.0
     assert run.tracking_errors[-1] < 0.5
@@ -82,6 +87,6 @@ def test_long_horizon_passes_rather_than_trails():
 
 def test_a_gust_that_closes_one_way_does_not_cost_safety_while_another_is_open():
     """Around step 245 the controller's own way is closed; a longer one is not."""
-    run = simulate(SCENARIOS["scenario-4"], steps=255)
+    run = SCENARIOS["scenario-4"].run(steps=255)
     assert all(plan.ok for plan in run.plans[100:])
     assert any(plan.switched for plan in run.plans[240:250])
