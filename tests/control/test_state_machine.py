@@ -186,11 +186,12 @@ def equal(first, second):
     )
 
 
-def test_any_sequence_of_calls():
+@pytest.mark.parametrize("examples", [40, pytest.param(100, marks=pytest.mark.slow)])
+def test_any_sequence_of_calls(examples):
     run_state_machine_as_test(
         Control,
         settings=hypothesis_settings(
-            max_examples=100,
+            max_examples=examples,
             stateful_step_count=25,
             deadline=None,
             derandomize=True,

@@ -41,14 +41,14 @@ def hold(problem, step, settings):
 @pytest.mark.parametrize(
     "settings", KINDS, ids=["default", "one", "piqp", "piqp one", "no time", "piqp no time"]
 )
-@profile(80)
+@profile(40)
 @given(st.data())
 def test_in_the_plane(settings, data):
     problem = data.draw(problems(horizons=(3, 8)))
     hold(problem, data.draw(steps(problem)), settings)
 
 
-@profile(30)
+@profile(15)
 @given(st.data())
 def test_in_space(data):
     problem = data.draw(problems(dim=3, horizons=(1, 5)))
