@@ -1,5 +1,7 @@
 """Nonlinear robots in closed loops: past obstacles, back on their line, with all of their discs."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from instances import obstacle, problem, straight_reference
@@ -73,19 +75,25 @@ def drive(mpc, x, reference, predictions, steps):
     return plans, np.array(states)
 
 
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("nodes_per_interval", [1, 4])
-def test_closed_loops_pass_the_obstacle_and_keep_rates(name, nodes_per_interval):
-    case = machine_problem(name, 15, nodes_per_interval=nodes_per_interval)
+# A robot that is only a function takes its time: 8 intervals of 2 points are the quick version.
+LOOPS = [
+    pytest.param(count, name, 15, marks=pytest.mark.slow if name == "function" else ())
+    for count, name in product([1, 4], MODELS)
+]
+
+
+@pytest.mark.parametrize(("nodes_per_interval", "name", "horizon"), [*LOOPS, (2, "function", 8)])
+def test_closed_loops_pass_the_obstacle_and_keep_rates(name, nodes_per_interval, horizon):
+    case = machine_problem(name, horizon, nodes_per_interval=nodes_per_interval)
     room = 0.25 * (case.u_max - case.u_min)
     case = machine_problem(
-        name, 15, nodes_per_interval=nodes_per_interval, du_min=-room, du_max=room
+        name, horizon, nodes_per_interval=nodes_per_interval, du_min=-room, du_max=room
     )
     model, shift = case.model, np.zeros(case.model.nx)
     shift[model.position[0]] = 1.5 * model.dt
-    ref, at = straight(model, 15), np.zeros(model.dim)
+    ref, at = straight(model, horizon), np.zeros(model.dim)
     at[:2] = 3.0, 0.1
-    there = ObstaclePrediction(np.tile(at, (16, 1)), 0.01 * np.eye(model.dim), 0.25)
+    there = ObstaclePrediction(np.tile(at, (horizon + 1, 1)), 0.01 * np.eye(model.dim), 0.25)
     mpc = MPC(case)
     plans, states = drive(mpc, ref[0], lambda k: ref + k * shift, lambda _: [there], 25)
     assert all(plan.ok for plan in plans)
