@@ -66,11 +66,12 @@ def test_01_covariances_at_the_edge_are_planned_with(deviations, inflation):
         solve_and_hold(case, REF[0], REF, [thing])
 
 
-def test_01_a_huge_covariance_does_not_spoil_a_thin_one():
+@pytest.mark.parametrize("count", [16, pytest.param(40, marks=pytest.mark.slow)])
+def test_01_a_huge_covariance_does_not_spoil_a_thin_one(count):
     """The thin one is a line; what counts as zero must not be measured by its neighbour."""
     case = problem(4)
     ref = straight_reference(4)
-    for seed in range(40):
+    for seed in range(count):
         rng = np.random.default_rng(seed)
         line = rotated((1.0, 0.0), rng.uniform(0.0, np.pi))
         covariances = np.tile((line + line.T) / 2, (5, 1, 1))
@@ -80,11 +81,12 @@ def test_01_a_huge_covariance_does_not_spoil_a_thin_one():
         solve_and_hold(case, ref[0], ref, [thing])
 
 
-def test_01_lines_in_space_may_go_through_the_robot():
+@pytest.mark.parametrize("count", [16, pytest.param(48, marks=pytest.mark.slow)])
+def test_01_lines_in_space_may_go_through_the_robot(count):
     case = problem(
         4, model=DoubleIntegrator(0.2, 3), Q=[0.2, 0.05] * 3, R=[0.001] * 3, max_obstacles=1
     )
-    for seed in range(48):
+    for seed in range(count):
         along = np.random.default_rng(seed).normal(size=3)
         thing = ObstaclePrediction(np.zeros((5, 3)), np.outer(along, along), 0.2)
         solve_and_hold(case, np.zeros(6), np.zeros(6), [thing])
