@@ -51,8 +51,14 @@ BAD_STEPS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def undisturbed():
+    """The plans of a drive without bad steps."""
+    return drive(MPC(problem(N)), 9)
+
+
 @pytest.mark.parametrize(("change", "error", "message"), BAD_STEPS)
-def test_a_bad_step_is_refused_and_leaves_no_trace(change, error, message):
+def test_a_bad_step_is_refused_and_leaves_no_trace(undisturbed, change, error, message):
     mpc = MPC(problem(N))
 
     def interrupt(k):
@@ -60,7 +66,7 @@ def test_a_bad_step_is_refused_and_leaves_no_trace(change, error, message):
             with pytest.raises(error, match=message):
                 mpc.step(**{**good(), **change})
 
-    assert same(drive(MPC(problem(N)), 9), drive(mpc, 9, interrupt))
+    assert same(undisturbed, drive(mpc, 9, interrupt))
 
 
 @pytest.mark.parametrize(

@@ -268,7 +268,7 @@ def test_the_risk_of_an_interval_is_shared_by_its_points():
 
 def written_out(case, step):
     """The program with its points between the samples, in CasADi's own words."""
-    U, s = casadi.MX.sym("U", 2, N), casadi.MX.sym("s")
+    U, s = casadi.SX.sym("U", 2, N), casadi.SX.sym("s")
     x, cost, g = casadi.DM(step.x0), case.size.weight * (s - case.size.reference) ** 2, []
     K = step.nodes.count
     for i in range(N):

@@ -1,6 +1,7 @@
 """The subproblem: fixed pattern, values through index maps, against a slow dense rebuild."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -184,18 +185,28 @@ def test_what_is_handed_out_is_the_callers_own():
     np.testing.assert_array_equal(solver.solve(x0, x_ref, things).U, expected.U)
 
 
-@pytest.mark.parametrize("solver", ["clarabel", "piqp"])
-@pytest.mark.parametrize("kind", ["ahead", "beside", "crossing", "elongated"])
-@pytest.mark.parametrize("name", ["linear", *MODELS])
-def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
+@cache
+def converged(name, kind):
+    """A step, its plan, and the program about it; None where no program has the plan's forces."""
     case = instance(kind, 8, "exact", 0.5, 1) if name == "linear" else ride(name, kind, 8, 1)
     scp = SCP(case.problem, Settings(tolerance=1e-9, max_iterations=200))
     given = case.x0, case.x_ref, case.obstacles
     plan = scp.solve(*given)
     assert plan.status.certified
     if not plan.ok and -plan.multipliers.obstacles.min() > case.problem.slack_weight:
-        return  # states yielded while obstacles held, with more than they may in an elastic one
-    program = scp.subproblem(*given, guess=plan.iterate, elastic=not plan.ok)
+        program = None  # states yielded while obstacles held, with more than an elastic one allows
+    else:
+        program = scp.subproblem(*given, guess=plan.iterate, elastic=not plan.ok)
+    return case, plan, program
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "piqp"])
+@pytest.mark.parametrize("kind", ["ahead", "beside", "crossing", "elongated"])
+@pytest.mark.parametrize("name", ["linear", *MODELS])
+def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
+    case, plan, program = converged(name, kind)
+    if program is None:
+        return
     z, y = solution(program, solver)
     e, u = np.split(z[: 8 * (case.problem.model.nx + plan.U.shape[1])], [8 * plan.X.shape[1]])
     np.testing.assert_allclose(u, plan.U.ravel(), atol=1e-5)
