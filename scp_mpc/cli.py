@@ -3,7 +3,6 @@
 import json as json_format
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -28,12 +27,10 @@ from scp_mpc.report import (
 from scp_mpc.simulation import (
     SCENARIOS,
     STEPS,
-    TRACKING,
     Crossing,
     Recording,
     Run,
     control_steps,
-    find_meetings,
     measure_coverage,
     read_recording,
     replay_problem,
@@ -201,7 +198,7 @@ def replay(
     with _one_line_errors():
         if (start is None) != (goal is None):
             raise InvalidArgumentError("start", "goes with a goal, and a goal with a start")
-        settings = replace(TRACKING, std_inflation=std_inflation)
+        tracking = TrackerSettings(confirmations=1, std_inflation=std_inflation)
         problem = replay_problem(horizon, Containment(level), obstacles)
         recording = _recording(file, rate, layout)
         if start is not None and goal is not None:
@@ -217,11 +214,10 @@ def replay(
                 noise=noise,
                 seed=seed,
                 steps=steps,
-                tracker_settings=settings,
+                tracking=tracking,
                 advance=bar.update,
             )
-        meetings = find_meetings(run)
-        numbers = summarise_replay(run, meetings)
+        numbers = {**summarise_replay(run), "noise_m": noise}
         table = Table(show_header=False)
         for name, value in replay_table(numbers):
             table.add_row(name, value)
@@ -230,7 +226,7 @@ def replay(
         if out is not None:
             _write_json(numbers, out / "replay.json")
             typer.echo("Drawing ...")
-            written = [save(replay_figure(run, meetings), out / "replay.png")]
+            written = [save(replay_figure(run), out / "replay.png")]
             if animation:
                 written.append(write_replay_animation(run, out / "replay.gif"))
             typer.echo(f"Written to {out}: {', '.join(path.name for path in written)}")

@@ -7,8 +7,7 @@ from scp_mpc.report.encounters import centre_distances, no_go_clearances
 from scp_mpc.report.exhibits import Exhibit, exhibits
 from scp_mpc.report.figures import FIGURES, write_figures
 from scp_mpc.report.history_figure import history_figure
-from scp_mpc.report.replay_animation import write_replay_animation
-from scp_mpc.report.replay_figure import replay_figure
+from scp_mpc.report.replay_picture import replay_figure, write_replay_animation
 from scp_mpc.report.replay_summary import replay_table, summarise_replay
 from scp_mpc.report.summary import summarise, table_cells, write_summary
 

@@ -25,14 +25,10 @@ from scp_mpc.simulation.drive import (
     drive,
 )
 from scp_mpc.simulation.episodes import run_episodes
-from scp_mpc.simulation.events import Contact, find_contacts
+from scp_mpc.simulation.events import Contact, Meeting, find_contacts, find_meetings
 from scp_mpc.simulation.flight import Flight
 from scp_mpc.simulation.gust import DrydenGust
 from scp_mpc.simulation.lag import ActuatorLag
-from scp_mpc.simulation.meetings import (
-    Meeting,
-    find_meetings,
-)
 from scp_mpc.simulation.overtaking import Overtaking
 from scp_mpc.simulation.plant import ModelPlant, Plant
 from scp_mpc.simulation.realisations import (
@@ -46,10 +42,9 @@ from scp_mpc.simulation.recordings import (
     read_recording,
 )
 from scp_mpc.simulation.replay import (
-    TRACKING,
-    Pass,
-    Replay,
+    RecordedSensor,
     control_steps,
+    recorded_people,
     replay,
     replay_problem,
 )
@@ -63,6 +58,7 @@ from scp_mpc.simulation.scenarios import (
 from scp_mpc.simulation.scene import Body, Scene
 from scp_mpc.simulation.sensor import PerfectSensor, Sensor, TrackedSensor
 from scp_mpc.simulation.simulate import Controller, simulate
+from scp_mpc.simulation.there_and_back import ThereAndBack, arrivals, crossing_of, time_alone
 
 __all__ = [
     "COUPLINGS",
@@ -70,7 +66,6 @@ __all__ = [
     "LEVELS",
     "SCENARIOS",
     "STEPS",
-    "TRACKING",
     "ActuatorLag",
     "Body",
     "ConstantPush",
@@ -89,26 +84,29 @@ __all__ = [
     "Meeting",
     "ModelPlant",
     "Overtaking",
-    "Pass",
     "PerfectSensor",
     "Plant",
+    "RecordedSensor",
     "Recording",
     "RecordingError",
-    "Replay",
     "Run",
     "Scenario",
     "Scene",
     "Sensor",
+    "ThereAndBack",
     "TrackedSensor",
     "World",
     "applicable_couplings",
+    "arrivals",
     "contacts",
     "control_steps",
+    "crossing_of",
     "drive",
     "find_contacts",
     "find_meetings",
     "measure_coverage",
     "read_recording",
+    "recorded_people",
     "replay",
     "replay_problem",
     "robot_path",
@@ -116,4 +114,5 @@ __all__ = [
     "sample_paths",
     "sampled_contacts",
     "simulate",
+    "time_alone",
 ]

@@ -1,12 +1,4 @@
-"""A robot that is to cross a scene, there and back again, along a straight line.
-
-Notation:
-    a, b    (2,)    ends of the line [m]            d   (2,)    its direction
-    l               its length [m]                  v           speed of the reference [m/s]
-
-The reference starts at the robot's own place along the line, so that it waits for a robot that
-is held up; at stage i it is min(that place + v i dt, l) along, on the line, and at rest at b.
-"""
+"""A straight line on which a robot is to cross a scene."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -22,6 +14,7 @@ from scp_mpc.simulation.recording import Recording
 Course = Literal["along", "across"]
 
 _OUTERMOST = 0.1  # share of the positions that lies beyond either end: people come from there
+_REACHED = 0.3  # [m] from the goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +76,6 @@ class Crossing:
         """The way back."""
         return replace(self, start=self.goal, goal=self.start)
 
-    def reference(self, position: FloatArray, horizon: int, dt: float) -> tuple[FloatArray, ...]:
-        """Positions and velocities (N+1, 2) of the reference for a robot that is there."""
-        d, v = self.direction, self.speed
-        begun = np.clip((position - self.start) @ d, 0.0, self.length)
-        way = begun + v * dt * np.arange(horizon + 1)
-        moving = (way < self.length)[:, None]
-        return self.start + np.minimum(way, self.length)[:, None] * d, np.where(moving, v * d, 0.0)
+    def reached(self, position: FloatArray) -> bool:
+        """Whether the goal is near enough to a position (2,)."""
+        return bool(np.linalg.norm(position - self.goal) <= _REACHED)

@@ -82,8 +82,8 @@ class Recording:
         return present, np.array(where).reshape(-1, 2)
 
 
-def along(times: FloatArray, positions: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return positions (k, d) of one person at the wanted times (k,), NaN where not present."""
+def along(times: FloatArray, positions: FloatArray, wanted: FloatArray | float) -> FloatArray:
+    """Return positions (..., d) of one person at the wanted times (...), NaN where not present."""
     gone = (wanted < times[0] - _TICK) | (wanted > times[-1] + _TICK)
     where = np.stack([np.interp(wanted, times, axis) for axis in positions.T], axis=-1)
     where[gone] = np.nan

@@ -1,12 +1,11 @@
 """Replay: a robot among recorded people, who walk as they did and do not react to it.
 
-At each control step: measure (at the recording's frames, with noise), predict, solve, apply. The
-robot crosses the scene, there and back again, for as long as the recording lasts.
+It sees them at the recording's frames, with noise, and crosses the scene, there and back again, for
+as long as the recording lasts. Time 0 of the run is the first frame.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from time import perf_counter
+from functools import partial
 
 import numpy as np
 
@@ -17,95 +16,84 @@ from scp_mpc.geometry.margin import Containment, MarginSpec
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.scp.plan import Status
 from scp_mpc.settings import Settings, StalenessPolicy, require_positive
 from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
+from scp_mpc.simulation.run import Run
+from scp_mpc.simulation.scene import Body, Scene
+from scp_mpc.simulation.simulate import simulate
+from scp_mpc.simulation.there_and_back import ThereAndBack
 from scp_mpc.tracking.tracker import Tracker, TrackerSettings
 
 DT = 0.2  # [s]
-TRACKING = TrackerSettings(
-    confirmations=1
-)  # with names nothing is a false alarm: tell of it at once
-REACHED = 0.3  # [m] from the goal
 _TICK = 1e-6  # [s]
+_ABSENT = np.full(2, np.nan)
 
 
-@dataclass(frozen=True)
-class Pass:
-    """One way from start to goal, control steps [first, last).
+def recorded_people(recording: Recording, radius: float = 0.3) -> list[Body]:
+    """Return everybody as a body of that radius [m], by name, absent where not recorded."""
+    begin = recording.times[0]
+    return [
+        Body(partial(_place, times - begin, positions), radius, name=name)
+        for name, (times, positions) in recording.paths.items()
+    ]
 
-    Attributes:
-        crossing: From where to where.
-        first: Step at which it begins.
-        last: Step at which the goal is reached, or the recording ends.
-        reached: Whether the goal was reached.
+
+def _place(times: FloatArray, positions: FloatArray, time: float) -> FloatArray:
+    if not times[0] - 1 < time < times[-1] + 1:  # most people, most of the time: quickly
+        return _ABSENT
+    return along(times, positions, time)
+
+
+class RecordedSensor:
+    """Measures people at the recording's own frames, with noise, and tracks them.
+
+    The robot is told of the nearest ones, as many as its problem has room for, and of its true
+    state.
+
+    Args:
+        recording: Who walks where.
+        noise: Standard deviation of each measured coordinate, which the tracker knows [m].
+        tracking: Of the tracker. With names nothing is a false alarm: by default people are told
+            of from their first measurement.
     """
 
-    crossing: Crossing
-    first: int
-    last: int
-    reached: bool
+    def __init__(
+        self, recording: Recording, noise: float = 0.05, tracking: TrackerSettings | None = None
+    ) -> None:
+        """Check the noise."""
+        require_positive("noise", noise)
+        self._recording, self._noise = recording, noise
+        self._tracking = TrackerSettings(confirmations=1) if tracking is None else tracking
 
+    def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
+        """Begin a new run."""
+        self._problem, self._rng, self._frame = problem, rng, 0
+        self._tracker = Tracker(
+            problem.model.dt,
+            problem.horizon,
+            radius=max(body.radius for body in scene.bodies),
+            measurement_std=self._noise,
+            settings=self._tracking,
+        )
 
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """A finished replay, K control steps long.
-
-    Attributes:
-        recording: Who walked where.
-        problem: What was solved at each step.
-        noise: Standard deviation of the measurements' errors [m].
-        seed: Of these errors.
-        radius: Of each person [m].
-        times: (K+1,) [s], on the recording's clock.
-        states: (K+1, nx) of the robot.
-        inputs: (K, nu) applied.
-        plans: (K, N+1, 2) planned positions [m].
-        predictions: K lists: what the controller was told.
-        slack: (K,) largest slack of each plan [m].
-        statuses: K of them.
-        seconds: (K,) wall time of each call of `MPC.step`.
-        tracking: (K,) wall time of measuring and predicting before it.
-        passes: In order; the last one may be unfinished.
-        alone: Seconds that one pass takes with nobody there.
-    """
-
-    recording: Recording
-    problem: Problem
-    noise: float
-    seed: int
-    radius: float
-    times: FloatArray
-    states: FloatArray
-    inputs: FloatArray
-    plans: FloatArray
-    predictions: list[list[ObstaclePrediction]]
-    slack: FloatArray
-    statuses: list[Status]
-    seconds: FloatArray
-    tracking: FloatArray
-    passes: list[Pass]
-    alone: float
-
-    @property
-    def steps(self) -> int:
-        """Number of control steps K."""
-        return len(self.inputs)
-
-    @property
-    def positions(self) -> FloatArray:
-        """(K+1, 2) of the robot [m]."""
-        return self.states[:, self.problem.model.position]
-
-    @property
-    def speeds(self) -> FloatArray:
-        """(K+1,) of the robot [m/s]."""
-        return np.linalg.norm(self.states[:, self.problem.model.position + 1], axis=1)
-
-    def people(self) -> dict[int, FloatArray]:
-        """Positions (K+1, 2) of everybody at the control steps [m], NaN where not present."""
-        return {name: along(*path, self.times) for name, path in self.recording.paths.items()}
+    def observe(
+        self,
+        time: float,
+        x: FloatArray,
+        positions: FloatArray,  # noqa: ARG002
+    ) -> tuple[FloatArray, list[ObstaclePrediction]]:
+        """See `Sensor`."""
+        frames = self._recording.times - self._recording.times[0]
+        while self._frame < len(frames) and frames[self._frame] <= time + _TICK:
+            where = self._recording.positions[self._frame]
+            measured = where + self._noise * self._rng.standard_normal(where.shape)
+            names = self._recording.names[self._frame].tolist()
+            self._tracker.update(frames[self._frame], measured, names)
+            self._frame += 1
+        told, here = self._tracker.predictions(time), x[self._problem.model.position]
+        told.sort(key=lambda o: float(np.linalg.norm(o.means[0] - here)))
+        return x, told[: self._problem.max_obstacles]
 
 
 def replay_problem(
@@ -141,21 +129,21 @@ def replay(
     seed: int = 0,
     radius: float = 0.3,
     steps: int | None = None,
-    tracker_settings: TrackerSettings | None = None,
+    tracking: TrackerSettings | None = None,
     settings: Settings | None = None,
     advance: Callable[[], object] = lambda: None,
-) -> Replay:
+) -> Run:
     """Drive the robot through a recorded crowd.
 
     Args:
         recording: Who walks where.
         crossing: What the robot is to cross; along the main flow if None.
-        problem: What to solve; that of `replay_problem` if None. A planar `DoubleIntegrator`.
+        problem: What to solve, for any planar robot; that of `replay_problem` if None.
         noise: Standard deviation of the measurements' errors, which the tracker knows [m].
         seed: Of the errors; the same one gives the same states.
         radius: Of each person [m].
         steps: Number of control steps K; as many as the recording has time for if None.
-        tracker_settings: How people are tracked; by default, told of from the first measurement.
+        tracking: How people are tracked; see `RecordedSensor`.
         settings: How to solve the problem; without memory of obstacles, which the tracker has, if
             None.
         advance: Called after each step, for a progress bar.
@@ -165,66 +153,17 @@ def replay(
     """
     crossing = Crossing.through(recording, "along") if crossing is None else crossing
     problem = replay_problem() if problem is None else problem
-    model = problem.model
-    if not isinstance(model, DoubleIntegrator) or model.dim != 2:
-        raise InvalidArgumentError("problem", "not of a planar DoubleIntegrator")
-    require_positive("noise", noise)
+    settings = Settings(staleness=StalenessPolicy(keep=0)) if settings is None else settings
     if seed < 0:
         raise BoundsError("seed", f"{seed} is negative")
-    K, dt = control_steps(recording, steps, model.dt), model.dt
-    mpc = MPC(
-        problem, Settings(staleness=StalenessPolicy(keep=0)) if settings is None else settings
-    )
-    tracker = Tracker(
-        dt,
-        problem.horizon,
-        radius=radius,
-        measurement_std=noise,
-        settings=TRACKING if tracker_settings is None else tracker_settings,
-    )
-    course = _Course(crossing, model, problem.horizon)
-    alone = _alone(crossing, MPC(problem, mpc.settings))
-    rng = np.random.default_rng(seed)
-    times = recording.times[0] + dt * np.arange(K + 1)
-    states, frame = [model.state(crossing.start, np.zeros(2))], 0
-    inputs, plans, told, slack, statuses, seconds, tracking = [], [], [], [], [], [], []
-    for k in range(K):
-        began = perf_counter()
-        while frame < len(recording.times) and recording.times[frame] <= times[k] + _TICK:
-            where = recording.positions[frame]
-            measured = where + noise * rng.standard_normal(where.shape)
-            tracker.update(recording.times[frame], measured, recording.names[frame].tolist())
-            frame += 1
-        near = _nearest(tracker.predictions(times[k]), states[-1][model.position], problem)
-        known = perf_counter()
-        plan = mpc.step(states[-1], course.reference(states[-1]), near, time=times[k])
-        seconds.append(perf_counter() - known)
-        tracking.append(known - began)
-        states.append(model.step(states[-1], plan.u0))
-        inputs.append(plan.u0)
-        plans.append(plan.X[:, model.position])
-        told.append(near)
-        slack.append(plan.slack.max(initial=0.0))
-        statuses.append(plan.status)
-        course.advance(states[-1], k + 1)
-        advance()
-    return Replay(
-        recording=recording,
-        problem=problem,
-        noise=float(noise),
+    people = recorded_people(recording, radius)
+    return simulate(
+        MPC(problem, settings),
+        ThereAndBack(crossing, problem.model, problem.horizon, people),
+        sensor=RecordedSensor(recording, noise, tracking),
+        steps=control_steps(recording, steps, problem.model.dt),
         seed=seed,
-        radius=float(radius),
-        times=times,
-        states=np.array(states),
-        inputs=np.array(inputs),
-        plans=np.array(plans),
-        predictions=told,
-        slack=np.array(slack),
-        statuses=statuses,
-        seconds=np.array(seconds),
-        tracking=np.array(tracking),
-        passes=course.finish(K),
-        alone=alone,
+        advance=advance,
     )
 
 
@@ -238,52 +177,3 @@ def control_steps(recording: Recording, steps: int | None = None, dt: float = DT
     if most < 1:
         raise InvalidArgumentError("recording", f"lasts less than {dt} s")
     return most if steps is None else min(as_count("steps", steps), most)
-
-
-class _Course:
-    """The passes, there and back again."""
-
-    def __init__(self, crossing: Crossing, model: DoubleIntegrator, horizon: int) -> None:
-        self._now, self._model, self._horizon = crossing, model, horizon
-        self._first = 0
-        self._passes: list[Pass] = []
-
-    def reference(self, x: FloatArray) -> FloatArray:
-        """States (N+1, nx) to track from x on."""
-        at = x[self._model.position]
-        return self._model.state(*self._now.reference(at, self._horizon, self._model.dt))
-
-    def advance(self, x: FloatArray, step: int) -> bool:
-        """Turn round if the goal is reached."""
-        there = np.linalg.norm(x[self._model.position] - self._now.goal) <= REACHED
-        if there:
-            self._passes.append(Pass(self._now, self._first, step, reached=True))
-            self._now, self._first = self._now.reversed(), step
-        return bool(there)
-
-    def finish(self, steps: int) -> list[Pass]:
-        """All passes; the last one may be unfinished."""
-        if self._first < steps:
-            self._passes.append(Pass(self._now, self._first, steps, reached=False))
-        return self._passes
-
-
-def _nearest(
-    predictions: list[ObstaclePrediction], position: FloatArray, problem: Problem
-) -> list[ObstaclePrediction]:
-    """As many as there are slots for, the nearest ones now."""
-    distances = [float(np.linalg.norm(o.means[0] - position)) for o in predictions]
-    return [predictions[j] for j in np.argsort(distances)[: problem.max_obstacles]]
-
-
-def _alone(crossing: Crossing, mpc: MPC) -> float:
-    """Seconds that one pass takes with nobody there."""
-    model = mpc.problem.model
-    assert isinstance(model, DoubleIntegrator)
-    course = _Course(crossing, model, mpc.problem.horizon)
-    x, most = model.state(crossing.start, np.zeros(2)), 100 + int(10 * crossing.length / model.dt)
-    for k in range(most):
-        x = model.step(x, mpc.step(x, course.reference(x)).u0)
-        if course.advance(x, k + 1):
-            return (k + 1) * model.dt
-    raise InvalidArgumentError("problem", "its robot does not reach the goal with nobody there")

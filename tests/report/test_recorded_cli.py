@@ -49,7 +49,8 @@ def test_replay_prints_and_writes(file, tmp_path):
     result = invoke("replay", file, "--out", out, "--steps", 10)
     assert result.exit_code == 0, result.output
     assert "do not react" in result.output
-    assert "People touched" in result.output
+    for row in ("People; touched", "Contacts; within 1 s", "robot is at rest", "runs into"):
+        assert row in result.output
     sizes = {path.name: path.stat().st_size for path in out.iterdir()}
     assert set(sizes) == {"replay.json", "replay.png", "replay.gif"}
     assert min(sizes.values()) > 500

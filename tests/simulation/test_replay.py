@@ -4,20 +4,17 @@ import numpy as np
 import pytest
 from recordings import street
 
-from scp_mpc import DoubleIntegrator, Problem, Status
+from scp_mpc import MPC, DoubleIntegrator, Problem, Status, Unicycle
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.report import replay_table, summarise_replay
-from scp_mpc.report.replay_animation import animated_steps
-from scp_mpc.report.replay_figure import nearest_clearance
-from scp_mpc.simulation import (
-    Crossing,
-    Recording,
-    control_steps,
-    find_meetings,
-    replay,
-    replay_problem,
-    robot_path,
-)
+from scp_mpc.report import replay_figure, replay_table, summarise_replay
+from scp_mpc.report.replay_picture import animated_steps
+from scp_mpc.simulation.crossing import Crossing
+from scp_mpc.simulation.events import find_contacts, find_meetings
+from scp_mpc.simulation.recording import Recording
+from scp_mpc.simulation.replay import control_steps, recorded_people, replay, replay_problem
+from scp_mpc.simulation.scene import Scene
+from scp_mpc.simulation.simulate import simulate
+from scp_mpc.simulation.there_and_back import ThereAndBack, arrivals, time_alone
 
 
 @pytest.fixture(scope="module")
@@ -27,18 +24,19 @@ def run():
 
 def test_the_robot_crosses_and_touches_nobody(run):
     assert run.steps == 78
-    done = [o for o in run.passes if o.reached]
-    assert len(done) >= 1
-    for one, after in zip(run.passes, run.passes[1:], strict=False):
-        assert one.last == after.first
-        assert np.linalg.norm(run.positions[one.last] - one.crossing.goal) <= 0.3
-        assert np.array_equal(after.crossing.start, one.crossing.goal)
-    assert run.passes[-1].last == run.steps
+    ends = arrivals(run)
+    assert len(ends) >= 1
+    for k, y in zip(ends, (5, -5, 5), strict=False):
+        distances = np.linalg.norm(run.positions - [0, y], axis=1)
+        assert distances[k] <= 0.3 < distances[k - 1]
+        assert np.sign(np.array(run.references)[k:, -1, 2] - run.positions[k, 1])[0] == -np.sign(y)
     meetings = find_meetings(run)
     assert not any(meeting.touched for meeting in meetings)
-    assert meetings[0].clearance > 0
-    assert set(run.statuses) <= {Status.CONVERGED, Status.FEASIBLE, Status.SOFTENED}
-    assert 6 < run.alone < 12
+    assert find_contacts(run) == []
+    assert meetings[0].clearance == run.clearances.min() > 0
+    statuses = {plan.status for plan in run.plans}
+    assert statuses <= {Status.CONVERGED, Status.FEASIBLE, Status.SOFTENED}
+    assert 6 < time_alone(run) < 12
     assert (np.abs(run.inputs) <= 3 + 1e-9).all()
 
 
@@ -47,34 +45,58 @@ def test_same_seed_same_run():
     one, again, other = (replay(recording, seed=seed) for seed in (3, 3, 4))
     assert np.array_equal(one.states, again.states)
     assert not np.array_equal(one.states, other.states)
+    assert one.seed == 3
+
+
+def test_people_are_where_they_were_recorded(run):
+    """Bodies by name, straight between frames, on a clock that begins with the recording."""
+    recording = street(people=4, frames=40, seed=2)
+    late = Recording(recording.times + 7.3, recording.names, recording.positions)
+    for people in (recorded_people(recording), recorded_people(late)):
+        assert [body.name for body in people] == [0, 1, 2, 3]
+        for k in (0, 1, 17, 31):
+            names, places = recording.at(0.2 * k)
+            there = [body.name for body in people if not np.isnan(body.at(0.2 * k)).any()]
+            assert there == names.tolist()
+            np.testing.assert_allclose([people[j].at(0.2 * k) for j in there], places)
+            np.testing.assert_allclose(run.bodies[k, there], places)
+    crossing = Crossing([0, -5], [0, 5])
+    np.testing.assert_allclose(replay(late, crossing, steps=20).states, run.states[:21], atol=1e-6)
 
 
 def test_the_tracker_gets_noisy_measurements_as_they_come(run):
     """Predictions of a step know the frames up to it and no later ones."""
-    people = run.people()
     k = 31
     for o in run.predictions[k]:
         assert o.stamp == pytest.approx(run.times[k])
-        assert 0 < np.linalg.norm(o.means[0] - people[o.name][k]) < 0.4
+        assert 0 < np.linalg.norm(o.means[0] - run.bodies[k, o.name]) < 0.4
         assert o.horizon == run.problem.horizon
-    new = replay(street(people=4, frames=40, seed=2), Crossing([0, -5], [0, 5]), steps=32)
+    recording = street(people=4, frames=40, seed=2)
+    seen = Recording(recording.times[:17], recording.names[:17], recording.positions[:17])
+    new = replay(seen, Crossing([0, -5], [0, 5]))
     assert np.array_equal(new.states, run.states[:33])
 
 
-def test_meetings_are_those_of_a_fine_loop(run):
-    path = robot_path(run.problem.model, run.states, run.inputs)
-    people = run.people()
-    for meeting in find_meetings(run):
-        places, nearest = people[meeting.name], np.inf
-        for k in range(run.steps):
-            for fraction in np.linspace(0, 1, 33):
-                person = (1 - fraction) * places[k] + fraction * places[k + 1]
-                distance = np.linalg.norm(path[k, round(32 * fraction)] - person)
-                if distance < nearest:  # never for NaN
-                    nearest, at = distance, k
-        assert meeting.clearance == pytest.approx(nearest - 0.6)
-        assert meeting.step == at
-    assert np.nanmin(nearest_clearance(run)) >= find_meetings(run)[0].clearance - 1e-9
+def test_the_nearest_are_told_of():
+    problem = replay_problem(horizon=5, max_obstacles=2)
+    run = replay(street(people=5, frames=20), Crossing([0, -5], [0, 5]), problem)
+    for told, x, bodies in zip(run.predictions, run.positions, run.bodies, strict=False):
+        distances = np.linalg.norm(bodies - x, axis=1)
+        there = np.flatnonzero(~np.isnan(distances))
+        assert len(told) == min(2, len(there))
+        furthest = max(distances[o.name] for o in told)
+        assert (distances[there] < furthest - 0.3).sum() < 2
+
+
+def test_a_robot_with_a_nose():
+    problem = Problem(
+        Unicycle(0.2), horizon=12, Q=[1, 1, 0.02, 0.1], R=[0.05, 0.05], u_min=-2, u_max=2,
+        robot_radius=0.3, max_obstacles=4,
+    )  # fmt: skip
+    run = replay(street(people=4, frames=30, seed=2), Crossing([0, -3], [0, 3]), problem)
+    assert np.allclose(run.states[0], [0, -3, np.pi / 2, 0])
+    assert len(arrivals(run)) >= 2
+    assert run.clearances.min() > 0
 
 
 def test_somebody_fast_is_touched_between_samples():
@@ -90,10 +112,20 @@ def test_somebody_fast_is_touched_between_samples():
     (meeting,) = find_meetings(run)
     assert meeting.touched
     assert meeting.clearance == pytest.approx(0.05 - 0.2)
-    assert np.nanmin(nearest_clearance(run)) > 1.0
+    assert np.linalg.norm(run.bodies[:, 0] - run.positions, axis=1).min() > 1.0
     assert meeting.speed == 0
-    numbers = summarise_replay(run, [meeting])
-    assert (numbers["contacts"], numbers["contacts_robot_slow"]) == (1, 1)
+    numbers = summarise_replay(run)
+    assert numbers["people_touched"] == 1
+    assert numbers["contacts"] == {"count": 1, "new": 1}
+    assert numbers["contacts_by_kind"] == {
+        "at rest": {"count": 1, "new": 1},
+        "struck": {"count": 0, "new": 0},
+        "at fault": {"count": 0, "new": 0},
+    }
+    table = dict(replay_table(numbers))
+    assert table["Contacts; within 1 s of appearing"] == "1; 1"
+    assert table["  the robot is at rest"] == "1; 1"
+    assert table["  the robot runs into somebody"] == "0; 0"
 
 
 def test_courses_follow_the_flow():
@@ -107,35 +139,69 @@ def test_courses_follow_the_flow():
 
 
 def test_the_reference_waits_for_the_robot_and_ends_at_the_goal():
-    crossing = Crossing([0, 0], [10, 0], speed=1.0)
-    positions, velocities = crossing.reference(np.array([8.0, 3.0]), 5, 0.5)
-    assert np.allclose(positions, [[x, 0] for x in (8, 8.5, 9, 9.5, 10, 10)])
-    assert np.allclose(velocities, [[v, 0] for v in (1, 1, 1, 1, 0, 0)])
-    positions, _ = crossing.reference(np.array([-3.0, 1.0]), 2, 0.5)
-    assert np.allclose(positions, [[0, 0], [0.5, 0], [1, 0]])
+    scene = ThereAndBack(Crossing([0, 0], [10, 0], speed=1.0), DoubleIntegrator(0.5), horizon=5)
+    x_ref = scene.x_ref(0.0, np.array([8.0, 0, 3, 0]))
+    assert np.allclose(x_ref[:, [0, 2]], [[x, 0] for x in (8, 8.5, 9, 9.5, 10, 10)])
+    assert np.allclose(x_ref[:, [1, 3]], [[v, 0] for v in (1, 1, 1, 1, 0, 0)])
+    x_ref = scene.x_ref(0.5, np.array([-3.0, 0, 1, 0]))
+    assert np.allclose(x_ref[:3, [0, 2]], [[0, 0], [0.5, 0], [1, 0]])
 
 
-def test_summary_and_table(run):
-    meetings = find_meetings(run)
-    numbers = summarise_replay(run, meetings)
+def test_the_scene_turns_round_and_begins_anew():
+    scene = ThereAndBack(Crossing([0, 0], [10, 0]), DoubleIntegrator(0.5), horizon=5)
+    there, middle = np.array([9.8, 0, 0, 0]), np.array([5.0, 0, 0, 0])
+    assert scene.x_ref(0, middle)[1, 1] == pytest.approx(1.3)
+    scene.advance(0.5, there)
+    assert scene.x_ref(0.5, middle)[1, 1] == pytest.approx(-1.3)
+    scene.reset(np.random.default_rng())
+    assert scene.x_ref(0, middle)[1, 1] == pytest.approx(1.3)
+
+
+def test_summary_table_and_figure(run):
+    numbers = summarise_replay(run)
     assert numbers["people"] == 4
-    assert numbers["contacts"] == 0
+    assert numbers["contacts"] == {"count": 0, "new": 0}
     assert sum(numbers["statuses"].values()) == numbers["steps"] == 78
     assert numbers["pass_mean_s"] >= numbers["pass_alone_s"] - 1.0
-    assert numbers["min_clearance_m"] == meetings[0].clearance
+    ends = 0.2 * np.array([0, *arrivals(run)])
+    assert numbers["passes"] == len(ends) - 1
+    assert numbers["pass_max_s"] == pytest.approx(np.diff(ends).max())
+    assert numbers["min_clearance_m"] == numbers["closest"][0]["clearance"]
     assert 0 < numbers["furthest_beside_m"] < 5
     assert all(value for _, value in replay_table(numbers))
     steps = animated_steps(run)
     assert len(steps) == 78
     assert steps.stop <= run.steps
+    ways, clearance = replay_figure(run).axes
+    numbered = [[text.get_text() for text in axes.texts] for axes in (ways, clearance)]
+    assert numbered == [["1", "2", "3", "4"]] * 2
+    drawn = clearance.lines[0].get_ydata()
+    assert min(drawn) == numbers["min_clearance_m"]
 
 
 def test_nobody_near_and_no_pass_done():
     recording = street(people=1, frames=6)
     run = replay(recording, Crossing([50, 0], [50, 10]))
-    assert [o.reached for o in run.passes] == [False]
-    table = dict(replay_table(summarise_replay(run, find_meetings(run))))
+    assert arrivals(run) == []
+    table = dict(replay_table(summarise_replay(run)))
     assert table["Time of a pass, mean; longest [s]"] == "none; none"
+
+
+def test_a_robot_that_cannot_move_has_no_time_of_its_own():
+    problem = Problem(
+        DoubleIntegrator(0.2), horizon=3, Q=[1, 1, 1, 1], R=[1, 1], u_min=0, u_max=0,
+        max_obstacles=1,
+    )  # fmt: skip
+    run = replay(street(people=1, frames=6), Crossing([0, 0], [0, 1]), problem, steps=2)
+    assert time_alone(run) is None
+    assert dict(replay_table(summarise_replay(run)))["The same with nobody there [s]"] == "none"
+
+
+def test_another_scene_has_no_passes():
+    problem = replay_problem(horizon=3)
+    elsewhere = simulate(MPC(problem), Scene(np.zeros(4), np.zeros(4)), steps=1)
+    with pytest.raises(InvalidArgumentError, match="of a Scene, not there and back"):
+        arrivals(elsewhere)
 
 
 def test_bad_arguments_are_refused():
