@@ -88,22 +88,22 @@ class Referee:
 
     def angles(self, positions: np.ndarray, s: float) -> np.ndarray:
         """Angle of the outward normal at each position, by search on a grid and bisection."""
+        deltas = positions - self.obstacle.means[1:]
+        Sigmas = self.obstacle.covariances[1:]
+
+        def best(theta):
+            """The one of (N, K) angles at which each position is farthest out, (N, 1)."""
+            n = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+            spreads = np.sqrt(np.einsum("nki,nij,nkj->nk", n, Sigmas, n))
+            farthest = np.argmax(np.einsum("nki,ni->nk", n, deltas) - s * spreads, axis=1)
+            return np.take_along_axis(theta, farthest[:, None], axis=1)
+
         grid = np.linspace(0.0, _TWO_PI, 721)
-        angles = []
-        for p, mu, Sigma in zip(
-            positions, self.obstacle.means[1:], self.obstacle.covariances[1:], strict=True
-        ):
-
-            def distance(theta, p=p, mu=mu, Sigma=Sigma):
-                n = np.array([np.cos(theta), np.sin(theta)])
-                return n.T @ (p - mu) - s * np.sqrt(np.einsum("i...,ij,j...", n, Sigma, n))
-
-            centre, width = grid[np.argmax(distance(grid))], grid[1]
-            for _ in range(12):
-                local = centre + width * np.linspace(-1.0, 1.0, 41)
-                centre, width = local[np.argmax(distance(local))], width / 10
-            angles.append(_polished(centre, p - mu, Sigma, s))
-        return np.array(angles)
+        centre, width = best(np.tile(grid, (len(deltas), 1))), grid[1]
+        for _ in range(12):
+            centre, width = best(centre + width * np.linspace(-1.0, 1.0, 41)), width / 10
+        found = zip(centre[:, 0], deltas, Sigmas, strict=True)
+        return np.array([_polished(theta, delta, Sigma, s) for theta, delta, Sigma in found])
 
     def kkt(self, plan: Plan) -> dict[str, float]:
         """KKT residuals of the original problem at a plan and its multipliers."""
