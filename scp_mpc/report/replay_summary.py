@@ -23,7 +23,7 @@ _KINDS = {
 def summarise_replay(run: Run) -> dict[str, Any]:
     """Return the numbers of a replay, ready for JSON; times and distances in SI units."""
     meetings, contacts, line = find_meetings(run), find_contacts(run), crossing_of(run)
-    durations = (np.diff(run.times[[0, *arrivals(run)]])).tolist()
+    durations = np.diff(run.times[[0, *arrivals(run)]]).tolist()
     beside = (run.positions - line.start) @ np.array([-line.direction[1], line.direction[0]])
     slack = np.array([plan.slack.max(initial=0.0) for plan in run.plans])
     return {

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from scp_mpc.arrays import FloatArray, IntArray, as_number, frozen
+from scp_mpc.arrays import FloatArray, IntArray, frozen
 from scp_mpc.errors import InvalidArgumentError
 
 _TICK = 1e-6  # [s]; sums of intervals are no more exact than that
@@ -63,27 +63,13 @@ class Recording:
         pieces = zip(np.split(t, first[1:]), np.split(p, first[1:]), strict=True)
         return {int(name): piece for name, piece in zip(people, pieces, strict=True)}
 
-    @cached_property
-    def _presence(self) -> tuple[IntArray, FloatArray]:
-        """Everybody's name, and first and last time (n, 2)."""
-        spans = [(t[0], t[-1]) for t, _ in self.paths.values()]
-        return np.array(list(self.paths), np.intp), np.array(spans)
-
-    def at(self, time: float) -> tuple[IntArray, FloatArray]:
-        """Return names (n,) and positions (n, 2) of those who are present at a time.
-
-        Everybody is present from their first to their last annotation, and walks straight from
-        one to the next at constant speed.
-        """
-        t = as_number("time", time)
-        names, spans = self._presence
-        present = names[(spans[:, 0] <= t + _TICK) & (t - _TICK <= spans[:, 1])]
-        where = [along(*self.paths[int(name)], np.array([t]))[0] for name in present]
-        return present, np.array(where).reshape(-1, 2)
-
 
 def along(times: FloatArray, positions: FloatArray, wanted: FloatArray | float) -> FloatArray:
-    """Return positions (..., d) of one person at the wanted times (...), NaN where not present."""
+    """Return positions (..., d) of one person at the wanted times (...), NaN where not present.
+
+    Everybody is present from the first to the last annotation, and walks straight from one to the
+    next at constant speed.
+    """
     gone = (wanted < times[0] - _TICK) | (wanted > times[-1] + _TICK)
     where = np.stack([np.interp(wanted, times, axis) for axis in positions.T], axis=-1)
     where[gone] = np.nan
