@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.circuits import Circuit
 from benchmarks.figures import BLUE, VERMILION, canvas, legend_below, plain
 from benchmarks.progress import progress
 from benchmarks.tables import table
@@ -20,7 +21,6 @@ from benchmarks.timing import closed_loop, milliseconds
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
-from scp_mpc.simulation.circuits import Circuit
 from scp_mpc.simulation.contact import FINE, robot_path
 from scp_mpc.simulation.crowds import Crowd
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario

@@ -18,18 +18,10 @@ from scp_mpc.simulation.disturbance import (
     CorrelatedDisturbance,
     Disturbance,
 )
-from scp_mpc.simulation.doorway import Doorway
-from scp_mpc.simulation.drive import (
-    Drive,
-    World,
-    drive,
-)
 from scp_mpc.simulation.episodes import run_episodes
 from scp_mpc.simulation.events import Contact, Meeting, find_contacts, find_meetings
-from scp_mpc.simulation.flight import Flight
 from scp_mpc.simulation.gust import DrydenGust
 from scp_mpc.simulation.lag import ActuatorLag
-from scp_mpc.simulation.overtaking import Overtaking
 from scp_mpc.simulation.plant import ModelPlant, Plant
 from scp_mpc.simulation.realisations import (
     COUPLINGS,
@@ -76,14 +68,10 @@ __all__ = [
     "Crossing",
     "Crowd",
     "Disturbance",
-    "Doorway",
-    "Drive",
     "DrydenGust",
-    "Flight",
     "LeadCoverage",
     "Meeting",
     "ModelPlant",
-    "Overtaking",
     "PerfectSensor",
     "Plant",
     "RecordedSensor",
@@ -95,13 +83,11 @@ __all__ = [
     "Sensor",
     "ThereAndBack",
     "TrackedSensor",
-    "World",
     "applicable_couplings",
     "arrivals",
     "contacts",
     "control_steps",
     "crossing_of",
-    "drive",
     "find_contacts",
     "find_meetings",
     "measure_coverage",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import robots
-from scp_mpc.simulation.circuits import CIRCLING, Circuit
+from benchmarks.circuits import CIRCLING, Circuit
 
 
 @pytest.mark.parametrize("robot", CIRCLING)

@@ -119,8 +119,9 @@ def test_the_package_knows_nothing_of_the_benchmarks():
         assert not [module for module in imports(path) if module.split(".")[0] == "benchmarks"]
 
 
-def test_benchmarks_and_notebooks_use_no_private_names():
-    sources = {path.name: path.read_text() for path in (ROOT / "benchmarks").rglob("*.py")}
+def test_benchmarks_examples_and_notebooks_use_no_private_names():
+    paths = [*(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "examples").glob("*.py")]
+    sources = {path.name: path.read_text() for path in paths}
     for path in (ROOT / "notebooks").glob("*.ipynb"):
         cells = json.loads(path.read_text())["cells"]
         code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
