@@ -64,6 +64,7 @@ class RecordedSensor:
         """Check the noise."""
         require_positive("noise", noise)
         self._recording, self._noise = recording, noise
+        self._times = recording.times - recording.times[0]
         self._tracking = TrackerSettings(confirmations=1) if tracking is None else tracking
 
     def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
@@ -84,12 +85,11 @@ class RecordedSensor:
         positions: FloatArray,  # noqa: ARG002
     ) -> tuple[FloatArray, list[ObstaclePrediction]]:
         """See `Sensor`."""
-        frames = self._recording.times - self._recording.times[0]
-        while self._frame < len(frames) and frames[self._frame] <= time + _TICK:
+        while self._frame < len(self._times) and self._times[self._frame] <= time + _TICK:
             where = self._recording.positions[self._frame]
             measured = where + self._noise * self._rng.standard_normal(where.shape)
             names = self._recording.names[self._frame].tolist()
-            self._tracker.update(frames[self._frame], measured, names)
+            self._tracker.update(self._times[self._frame], measured, names)
             self._frame += 1
         told, here = self._tracker.predictions(time), x[self._problem.model.position]
         told.sort(key=lambda o: float(np.linalg.norm(o.means[0] - here)))
