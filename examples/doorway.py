@@ -64,7 +64,7 @@ def scene() -> Scene:
     way = Way.spline([[0.8, 1.4], [2.8, 2.6], [6.15, 3.6], [8.8, 4.2], [11.2, 5.6]])
     limits = SpeedLimits(1.1, lateral=0.6, longitudinal=0.6)
     follow = PathReference(way, speed=limits, model=problem.model, horizon=N)
-    bodies = [Body([0.0, 0.0], 0.05, shape=wall) for wall in WALLS]
+    bodies = [Body(np.zeros(2), 0.05, shape=wall) for wall in WALLS]
     bodies += [walking(*person) for person in PEOPLE]
     dx, dy = way.tangents(0.0)
     start = [*way.positions(0.0), np.arctan2(dy, dx), 0.0]
