@@ -19,6 +19,7 @@ from benchmarks.tables import table
 from scp_mpc.control.mpc import MPC
 from scp_mpc.geometry.margin import Margin
 from scp_mpc.scp.solver import SCP
+from scp_mpc.settings import Settings
 from scp_mpc.simulation.scenarios import SCENARIOS, Scenario
 from scp_mpc.trajectory import Trajectory
 
@@ -53,7 +54,7 @@ def measure(
     """Drive one scenario and compare its active steps; see `rows`."""
     margin = None if s_min is None else Margin(lower=s_min)
     problem = scenario.problem("axes", margin)
-    mpc, plain, peer = MPC(problem), SCP(problem), Ipopt(problem)
+    mpc, plain, peer = MPC(problem, Settings(deadline=None)), SCP(problem), Ipopt(problem)
     rng = np.random.default_rng(seed)
     x, total, gaps, dt = scenario.start(), 0.0, [], problem.model.dt
     for k in range(steps):

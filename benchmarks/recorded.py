@@ -52,7 +52,7 @@ def record(
         advance: Called after each step, for a progress bar.
     """
     problem = scenario.problem() if problem is None else problem
-    mpc = MPC(problem, settings)
+    mpc = MPC(problem, Settings(deadline=None) if settings is None else settings)
     if isinstance(scenario, Crowd):
         run = simulate(mpc, scenario, steps=steps, advance=advance)
     else:

@@ -22,6 +22,7 @@ from scp_mpc.control.mpc import MPC
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor
 from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
 from scp_mpc.simulation.contact import contacts, robot_path
 
 HORIZON = 8
@@ -94,7 +95,7 @@ def drive(setting: RiskSetting, episodes: int, seed: int) -> Outcome:
         episodes: How many.
         seed: Of the encounters.
     """
-    mpc = MPC(episode_problem(setting))
+    mpc = MPC(episode_problem(setting), Settings(deadline=None))
     touched = steps = unsafe = 0
     for episode in range(episodes):
         mpc.reset()

@@ -129,7 +129,9 @@ def _row(
 ) -> dict[str, Any]:
     problem = course.problem
     run = list(
-        closed_loop(course.world, problem, Settings(multi_start=multi_start), steps, advance)
+        closed_loop(
+            course.world, problem, Settings(multi_start=multi_start, deadline=None), steps, advance
+        )
     )
     gaps = []
     for k, step in enumerate(run):

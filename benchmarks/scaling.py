@@ -121,7 +121,7 @@ def _steps(world: Scenario | Crowd, steps: int) -> int:
 def _row(
     world: Scenario | Crowd, multi_start: bool, steps: int, advance: Callable[[], object]
 ) -> dict[str, Any]:
-    settings = Settings(multi_start=multi_start)
+    settings = Settings(multi_start=multi_start, deadline=None)
     run = list(closed_loop(world, world.problem("axes"), settings, steps, advance))
     plans = [step.plan for step in run]
     programs: Counter[str] = sum((Counter(plan.qps) for plan in plans), Counter())

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.progress import progress
 from benchmarks.tables import table
-from scp_mpc import MPC, Margin
+from scp_mpc import MPC, Margin, Settings
 from scp_mpc.report.summary import summarise
 from scp_mpc.simulation import SCENARIOS
 
@@ -39,7 +39,7 @@ def _row(name: str, which: str, steps: int, advance: Callable[[], object]) -> di
     scenario = SCENARIOS[which]
     margin = Margin() if s_min is None else Margin(lower=s_min)
     shape: Any = inflation
-    run = scenario.run(MPC(scenario.problem(shape, margin)), steps)
+    run = scenario.run(MPC(scenario.problem(shape, margin), Settings(deadline=None)), steps)
     advance()
     return summarise(run) | {"variant": name, "wind": scenario.disturbance is not None}
 

@@ -81,7 +81,7 @@ def run_chunk(seed: int, index: int, steps: int) -> dict[str, Any]:
         mpc.reset()
         twin.reset()
         # A deadline on the scale of a step does not repeat itself.
-        paired = rng.random() < _TWIN and (kind.settings.deadline or 0.0) < 1e-5
+        paired = rng.random() < _TWIN and (kind.settings.time_limit() or 0.0) < 1e-5
         world = World(kind.problem, rng)
         for _ in range(min(EPISODE, steps - tally.steps)):
             _step(kind, mpc, twin if paired else None, world, rng, tally)
@@ -125,9 +125,10 @@ def _step(
     tally.statuses[plan.status.name] += 1
     tally.bins[str(int(np.floor(PER_DECADE * np.log10(seconds))))] += 1
     tally.slowest = max(tally.slowest, seconds)
-    if kind.settings.deadline is not None and kind.settings.deadline > 1e-5:
+    limit = kind.settings.time_limit()
+    if limit is not None and limit > 1e-5:
         tally.timed += 1
-        tally.late += seconds > 1.5 * kind.settings.deadline
+        tally.late += seconds > 1.5 * limit
     finding = audit(kind.problem, x, mpc.obstacles, plan)
     tally.invalid += bool(finding.invalid)
     tally.lies += bool(finding.lie)

@@ -18,6 +18,7 @@ SLOTS = 6
 _DT = 0.2  # [s]
 _FREE = Margin(lower=0.5)
 _SHORT = 1e-6  # [s] no time at all
+_UNTIMED = Settings(deadline=None)  # the same plans on any machine
 _KNOWN = ("disc", "ellipse", "line", "point", "huge", "needle")
 _SHARES = (0.5, 0.32, 0.1, 0.05, 0.015, 0.015)
 _COUNTS = (0.2, 0.25, 0.2, 0.15, 0.1, 0.05, 0.05)  # of 0 .. SLOTS obstacles
@@ -48,22 +49,28 @@ class Kind:
 def kinds() -> list[Kind]:
     """The problems of the soak; short horizons more often, which makes a million steps possible."""
     rows: list[tuple[str, float, int, dict[str, Any], Settings]] = [
-        ("exact", 4, 8, {}, Settings()),
-        ("axes", 3, 8, {"inflation": "axes"}, Settings()),
-        ("free size", 2, 8, {"margin": _FREE}, Settings()),
-        ("axes, free size", 1, 8, {"inflation": "axes", "margin": _FREE}, Settings()),
-        ("samples alone", 2, 8, {"nodes_per_interval": 1}, Settings()),
-        ("stage risk", 2, 8, {"margin": StageRisk(0.05)}, Settings()),
-        ("joint risk", 1, 8, {"margin": JointRisk(0.05)}, Settings()),
-        ("joint risk, iterative", 0.5, 8, {"margin": JointRisk(0.05, "iterative")}, Settings()),
-        ("biased limits", 2, 8, {"u_min": [-0.2, 0.3], "u_max": [2.0, 1.5]}, Settings()),
-        ("in space", 1, 8, {"model": DoubleIntegrator(_DT, 3)}, Settings(multi_start=False)),
+        ("exact", 4, 8, {}, _UNTIMED),
+        ("axes", 3, 8, {"inflation": "axes"}, _UNTIMED),
+        ("free size", 2, 8, {"margin": _FREE}, _UNTIMED),
+        ("axes, free size", 1, 8, {"inflation": "axes", "margin": _FREE}, _UNTIMED),
+        ("samples alone", 2, 8, {"nodes_per_interval": 1}, _UNTIMED),
+        ("stage risk", 2, 8, {"margin": StageRisk(0.05)}, _UNTIMED),
+        ("joint risk", 1, 8, {"margin": JointRisk(0.05)}, _UNTIMED),
+        ("joint risk, iterative", 0.5, 8, {"margin": JointRisk(0.05, "iterative")}, _UNTIMED),
+        ("biased limits", 2, 8, {"u_min": [-0.2, 0.3], "u_max": [2.0, 1.5]}, _UNTIMED),
+        (
+            "in space",
+            1,
+            8,
+            {"model": DoubleIntegrator(_DT, 3)},
+            replace(_UNTIMED, multi_start=False),
+        ),
         ("no time", 3, 8, {}, Settings(deadline=_SHORT)),
-        ("rescue", 0.3, 8, {}, Settings(solver="piqp", multi_start=False)),
-        ("two iterations", 2, 15, {}, Settings(max_iterations=2)),
-        ("stage risk", 0.5, 15, {"margin": StageRisk(0.05)}, Settings()),
+        ("rescue", 0.3, 8, {}, replace(_UNTIMED, solver="piqp", multi_start=False)),
+        ("two iterations", 2, 15, {}, replace(_UNTIMED, max_iterations=2)),
+        ("stage risk", 0.5, 15, {"margin": StageRisk(0.05)}, _UNTIMED),
         ("2 ms", 2, 30, {}, Settings(deadline=2e-3)),
-        ("exact", 0.5, 30, {}, Settings()),
+        ("exact", 0.5, 30, {}, _UNTIMED),
     ]
     return [
         Kind(f"{name}, N = {horizon}", share, _problem(horizon, **changes), settings)

@@ -103,7 +103,7 @@ class Variant:
         return scenario.run(self._controller(problem), steps, seed)
 
     def _controller(self, problem: Problem) -> Controller:
-        settings = Settings(multi_start=self.multi_start)
+        settings = Settings(multi_start=self.multi_start, deadline=None)
         fades = self.disturbance in ("report's wind", "none")
         model = as_linear("problem.model", problem.model)
         robot = Disturbed(model, 0.85, [1, 3]) if fades else Disturbed(model, 0.98)

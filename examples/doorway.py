@@ -74,7 +74,7 @@ def scene() -> Scene:
 def drive(steps: int = 100, seed: int = 0) -> Run:
     """Drive; nobody is told of who has not been seen twice, because then a velocity is known."""
     return simulate(
-        MPC(problem, Settings(multi_start_interval=4)),
+        MPC(problem, Settings(multi_start_interval=4, deadline=None)),
         scene(),
         sensor=TrackedSensor(noise=0.05, tracking=TrackerSettings(confirmations=2)),
         steps=steps,

@@ -96,7 +96,7 @@ def report(
     """Run the four scenarios; write their table, figures and animation."""
     with _one_line_errors():
         margin = Margin() if s_min is None else Margin(lower=s_min)
-        settings = Settings(multi_start=multi_start)
+        settings = Settings(multi_start=multi_start, deadline=None)
         shape = cast(Literal["axes", "exact"], inflation)  # the problem checks it
         problems = {name: o.problem(shape, margin) for name, o in SCENARIOS.items()}
         as_count("steps", steps)

@@ -1,16 +1,20 @@
 """Where the time of one control step goes, and whether what comes next still fits in."""
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import inf
 from time import perf_counter, thread_time
 
 _FORGET = 0.02  # of the difference to a shorter time, each time it is measured
 _EASE = 0.98  # of a time, each time that it stood in the way
-_HICCUP = 3.0  # times its own processor time: then most of a task's time was somebody else's
+_HICCUP = 3.0  # times what is known of a task, or its processor time: something else took it
 _LEAST = 1e-6  # [s] of any task
+_PATIENCE = 3  # times that a task is not begun before it is tried again, whatever is known
+_MOST_PATIENCE = 200
+_COUNTED = ("iteration", "candidate")  # tasks that solve a program
 
+Timer = Callable[[], float]
 Mark = tuple[float, float]  # seconds since the step began, and of its thread's processor time
 
 
@@ -18,87 +22,122 @@ class Pace:
     """How long tasks took lately: their longest times, slowly forgotten.
 
     One serves all steps of a controller, so that the first iteration of a step is predicted from
-    those of earlier steps. A single time in which the machine did something else is no time of the
-    task's; it counts if it happens twice in a row.
+    those of earlier steps. A single time that is far longer than all before it, or than what the
+    task worked in it, counts in full if it happens twice in a row. And what is known is tried
+    again: a task that was not begun a few times for its length is begun, and if it is that long
+    still, it is left alone for twice as many times.
     """
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
         self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._measured: defaultdict[str, int] = defaultdict(int)
         self._stalled: set[str] = set()
+        self._refused: defaultdict[str, int] = defaultdict(int)
+        self._patience: defaultdict[str, int] = defaultdict(lambda: _PATIENCE)
+        self._tried: set[str] = set()
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
-        return self._seconds[task]
+        return 0.0 if task in self._tried else self._seconds[task]
 
     def learn(self, task: str, seconds: float, worked: float = inf) -> None:
         """Take note of a measured time, and of the processor time within it."""
-        if seconds > _HICCUP * worked + _LEAST:
+        known, self._measured[task] = self._seconds[task], self._measured[task] + 1
+        if task in self._tried:
+            slow = seconds > known / 2
+            self._patience[task] = (
+                min(2 * self._patience[task], _MOST_PATIENCE) if slow else _PATIENCE
+            )
+            self._tried.discard(task)
+            known = known if slow else 0.0
+        believed = min(seconds, worked, _HICCUP * known if known else inf)
+        if seconds > _HICCUP * worked + _LEAST or (known and seconds > _HICCUP * known + _LEAST):
             again = task in self._stalled
             self._stalled.add(task)
-            seconds = seconds if again else worked
+            seconds = seconds if again else believed
         else:
             self._stalled.discard(task)
-        known = self._seconds[task]
-        self._seconds[task] = max(seconds, known - _FORGET * (known - seconds))
+        share = max(_FORGET, 1 / self._measured[task])
+        self._seconds[task] = max(seconds, known - share * (known - seconds))
 
-    def ease(self, task: str) -> None:
-        """Expect a little less, after a task was not begun: or it would never be again."""
+    def refused(self, task: str, never: bool) -> None:
+        """Note that a task was not begun; `never`, if by what is known no step has room for it."""
         self._seconds[task] *= _EASE
+        self._refused[task] += never
+        if self._refused[task] >= self._patience[task]:
+            self._refused[task] = 0
+            self._tried.add(task)
 
 
 class Clock:
-    """The time of one control step, and its deadline.
+    """The time of one control step, its deadline and its budget of programs.
 
     Args:
         deadline: Seconds after which the step is late; None for never.
         pace: Times of earlier steps.
+        programs: How many programs the step may solve or rank.
+        timer: Tells the time [s]; None for the machine's clock.
 
     Attributes:
         spent: Seconds by what they were spent on: "linearise", "update" or "solve".
     """
 
-    def __init__(self, deadline: float | None = None, pace: Pace | None = None) -> None:
+    def __init__(
+        self,
+        deadline: float | None = None,
+        pace: Pace | None = None,
+        programs: float = inf,
+        timer: Timer | None = None,
+    ) -> None:
         """Begin the step."""
         self._deadline = inf if deadline is None else deadline
-        self._pace = Pace() if pace is None else pace
+        self._pace, self._programs = Pace() if pace is None else pace, programs
+        self._now, self._worked = (perf_counter, thread_time) if timer is None else (timer, timer)
         self.spent: defaultdict[str, float] = defaultdict(float)
-        self._began = self._lap = perf_counter()
+        self._began = self._lap = self._now()
         self._booked = 0.0, 0.0  # seconds and processor time of tasks
 
     def elapsed(self) -> float:
         """Seconds since the step began."""
-        return perf_counter() - self._began
+        return self._now() - self._began
 
     def mark(self) -> Mark:
         """Where time stands now, for `learn`."""
-        return self.elapsed(), thread_time()
+        return self.elapsed(), self._worked()
 
     def charge(self, what: str) -> None:
         """Book the time since it was last booked."""
-        now = perf_counter()
+        now = self._now()
         self.spent[what] += now - self._lap
         self._lap = now
 
     def allows(self, task: str) -> bool:
-        """Whether a task, and what ends the step, are predicted to end before the deadline."""
-        if self._deadline == inf:
-            return True
-        needed = self._pace.expected(task) + self._pace.expected("ending")
-        if needed <= self._deadline - self.elapsed():
-            return True
-        self._pace.ease(task)
-        return False
+        """Whether a task, and what ends the step, are predicted to end before the deadline.
+
+        And whether the budget has room for it, if it solves a program.
+        """
+        if task in _COUNTED and self._programs < 1:
+            return False
+        if self._deadline < inf:
+            needed = self._pace.expected(task) + self._pace.expected("ending")
+            if needed > self._deadline - self.elapsed():
+                self._pace.refused(task, needed > self._deadline)
+                return False
+        self._programs -= task in _COUNTED
+        return True
 
     def room(self, task: str, most: int, then: str = "") -> int:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
+        if task in _COUNTED:
+            most = min(most, int(min(self._programs, most)))
         if self._deadline == inf:
             return most
         after = self._pace.expected(then) + self._pace.expected("ending")
         spare = self._deadline - self.elapsed() - after
         times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
         if times < most:
-            self._pace.ease(task)
+            self._pace.refused(task, after + self._pace.expected(task) > self._deadline)
         return times
 
     @contextmanager

@@ -8,29 +8,36 @@
                (likewise at the collision nodes within the interval before i)
                s_min <= s_j <= s_max,  u_min <= u_i <= u_max
                du_min <= u_i - u_{i-1} <= du_max  (u_{-1} the input last applied, if it is known)
-               x_min - e_i <= x_i <= x_max + e_i,  e_i >= 0
+               x_min - e_i <= x_i <= x_max + e_i,  |v_i| <= speed_max
 
 There is no factor 1/2 anywhere, and `Qf` replaces Q at i = N where it is given. Inputs are weighed
-from the model's `equilibrium_input`, which is zero but for robots that hover. Bounds of states
-and of rates are there where they are given. Those of states are softened by an exact L1 penalty:
-where they can be kept, they are, and the excess e is reported where they cannot, as after a start
-outside them. Those of inputs and rates are hard; for there always to be such inputs, holding an
-input must be allowed: du_min <= 0 <= du_max.
+from the model's `equilibrium_input`, which is zero but for robots that hover. Bounds of states,
+of speed and of rates are there where they are given, and hard. For there always to be such inputs,
+holding an input must be allowed: du_min <= 0 <= du_max. A state that is outside its bounds now, or
+that full braking carries outside, is bounded by what full braking reaches. Only the bounds of
+states that the user calls soft yield, at an exact L1 penalty and before the obstacles do.
+
+Bounds of states act on rows E x: the bounded states, and normals of a polytope inscribed into the
+ball of velocities that `speed_max` allows (16 faces in the plane, 38 in space: at least 98 % and
+92 % of it in any direction).
 
 Notation:
     e (N, nx)   excess of the states over their bounds: max(0, x - x_max, x_min - x)
     v           `state_slack_weight`
+    E (nb, nx)  rows of bounded states, and of speed
 """
 
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
+from functools import cache, cached_property
+from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import HalfspaceIntersection
 
 from scp_mpc.arrays import (
+    BoolArray,
     FloatArray,
     IntArray,
     as_array,
@@ -79,12 +86,16 @@ class Problem:
         x_min: Lower bounds of the states at stages 1 .. N, a number or (nx,); entries may be minus
             infinity. None: no lower bounds.
         x_max: Upper bounds likewise; entries may be infinity.
+        x_soft: Which bounds of states may yield, at `state_slack_weight`, before obstacles do: a
+            truth value or (nx,) of them. By default none.
+        speed_max: Largest Euclidean speed at stages 1 .. N [m/s], for models whose state holds a
+            velocity; None for no limit.
         du_min: Lower bounds of the change u_i - u_{i-1} of the input from one interval to the next
             [unit of the input per interval], a number or (nu,), never positive; entries may be
             minus infinity. None: no lower bounds.
         du_max: Upper bounds likewise, never negative; entries may be infinity.
-        state_slack_weight: Cost per unit and stage by which a state is outside its bounds. The
-            penalty is exact as long as it exceeds the state bounds' multipliers.
+        state_slack_weight: Cost per unit and stage by which a soft state is outside its bounds.
+            The penalty is exact as long as it exceeds the bounds' multipliers.
         discs: (n,) centres of the discs of `robot_radius` that cover a longer robot, from its
             position along its heading [m]; for models that have one.
 
@@ -107,6 +118,8 @@ class Problem:
     slack_weight: float
     x_min: FloatArray
     x_max: FloatArray
+    x_soft: BoolArray
+    speed_max: float | None
     du_min: FloatArray
     du_max: FloatArray
     state_slack_weight: float
@@ -130,6 +143,8 @@ class Problem:
         slack_weight: float = 1e3,
         x_min: ArrayLike | None = None,
         x_max: ArrayLike | None = None,
+        x_soft: ArrayLike = False,
+        speed_max: float | None = None,
         du_min: ArrayLike | None = None,
         du_max: ArrayLike | None = None,
         state_slack_weight: float = 100.0,
@@ -141,6 +156,10 @@ class Problem:
         horizon = as_count("horizon", horizon)
         lower, upper = _bounds(u_min, u_max, model.nu)
         lowest, highest = _state_bounds(x_min, x_max, model.nx)
+        if speed_max is not None:
+            require_positive("speed_max", speed_max)
+            if model.velocity is None:
+                raise InvalidArgumentError("speed_max", f"{type(model).__name__} has no velocity")
         fall, rise = _rate_bounds(du_min, du_max, model.nu)
         radius = as_number("robot_radius", robot_radius)
         if radius < 0:
@@ -176,6 +195,8 @@ class Problem:
             "slack_weight": float(slack_weight),
             "x_min": lowest,
             "x_max": highest,
+            "x_soft": _soft(x_soft, model.nx),
+            "speed_max": None if speed_max is None else float(speed_max),
             "du_min": fall,
             "du_max": rise,
             "state_slack_weight": float(state_slack_weight),
@@ -214,9 +235,33 @@ class Problem:
         return np.flatnonzero(np.isfinite(self.x_min) | np.isfinite(self.x_max))
 
     @cached_property
+    def state_rows(self) -> FloatArray:
+        """E (nb, nx): rows of the bounded states, then those of speed."""
+        rows = np.eye(self.model.nx)[self.bounded_states]
+        if self.speed_max is None or self.model.velocity is None:
+            return frozen(rows)
+        faces = np.zeros((len(_faces(len(self.model.velocity))), self.model.nx))
+        faces[:, self.model.velocity] = _faces(len(self.model.velocity))
+        return frozen(np.concatenate([rows, faces]))
+
+    @cached_property
+    def row_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds (nb,) of E x."""
+        lower, upper = self.x_min[self.bounded_states], self.x_max[self.bounded_states]
+        fast = np.full(len(self.state_rows) - len(lower), self.speed_max or 0.0)
+        return np.concatenate([lower, -fast]), np.concatenate([upper, fast])
+
+    @cached_property
+    def soft_rows(self) -> BoolArray:
+        """(nb,) which of E's rows may yield."""
+        soft = np.zeros(len(self.state_rows), dtype=np.bool_)
+        soft[: len(self.bounded_states)] = self.x_soft[self.bounded_states]
+        return soft
+
+    @cached_property
     def limits_states(self) -> bool:
-        """Whether any state has a finite bound."""
-        return len(self.bounded_states) > 0
+        """Whether any state or the speed has a finite bound."""
+        return len(self.state_rows) > 0
 
     @cached_property
     def limits_rates(self) -> bool:
@@ -263,8 +308,8 @@ class Problem:
     def penalty(self, slack: FloatArray, states: FloatArray) -> float:
         """Return the price of the obstacles' slack [m] and of the excess of states (N+1, nx)."""
         price = self.slack_weight * float(slack.sum())
-        if self.limits_states:
-            price += self.state_slack_weight * float(self.excess(states).sum())
+        if self.x_soft.any():
+            price += self.state_slack_weight * float(self.excess(states)[:, self.x_soft].sum())
         return price
 
     def cost(
@@ -307,6 +352,37 @@ def _state_bounds(
         at = int(np.argmax(lower > upper))
         raise BoundsError("x_min", f"{lower[at]} exceeds x_max = {upper[at]} for state {at}")
     return lower, upper
+
+
+def _soft(x_soft: ArrayLike, nx: int) -> BoolArray:
+    soft = np.array(x_soft)
+    if soft.dtype != np.bool_ or soft.shape not in ((), (nx,)):
+        raise InvalidArgumentError("x_soft", f"{x_soft!r} is no truth value and no {nx} of them")
+    soft = np.array(np.broadcast_to(soft, nx))
+    soft.setflags(write=False)
+    return soft
+
+
+@cache
+def _faces(dim: int) -> FloatArray:
+    """Normals a (m, dim) of a polytope |a'v| <= 1 that is inscribed into the unit ball.
+
+    In the plane a corner points along each axis, where nothing is lost.
+    """
+    if dim == 1:
+        return np.ones((1, 1))
+    if dim == 2:
+        angles = (np.arange(8) + 0.5) * np.pi / 8
+        normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    else:
+        kinds = (0, 0, 1), (1, 1, 1), (0, 1, 2)  # axes, diagonals, and between them
+        ways = [n for n in product(range(-2, 3), repeat=3) if tuple(sorted(map(abs, n))) in kinds]
+        normals = np.array([n for n in ways if n > (0, 0, 0)], dtype=np.float64)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    both = np.concatenate([normals, -normals])
+    cut = np.concatenate([both, -np.ones((len(both), 1))], axis=1)
+    corners = HalfspaceIntersection(cut, np.zeros(dim)).intersections
+    return normals * float(np.linalg.norm(corners, axis=1).max())
 
 
 def _rate_bounds(

@@ -109,7 +109,12 @@ class Settings:
             plan.
         max_candidates: How many of the ways past it to follow to the end; all are ranked.
         deadline: Seconds in which a step is to end: nothing is begun that is predicted, from how
-            long it took lately, to end later. None: take the time it takes.
+            long it took lately, to end later. "dt": for the controller `MPC` the sampling interval;
+            for one step of `SCP` alone none. None: take the time it takes, so that the same calls
+            give the same plans on any machine.
+        max_programs: Programs that one step may solve or rank, all runs and candidates together:
+            the worst case, also without a deadline.
+        max_replayed: Steps in a row that may live on an old plan before the robot brakes.
         history: Whether plans keep what happened in each SCP iteration.
         qp: OSQP's settings.
         staleness: How old predictions may be; for the controller `MPC` alone.
@@ -121,7 +126,9 @@ class Settings:
     multi_start: bool = True
     multi_start_interval: int = 1
     max_candidates: int = 1
-    deadline: float | None = None
+    deadline: float | Literal["dt"] | None = "dt"
+    max_programs: int = 200
+    max_replayed: int = 10
     history: bool = False
     qp: QPSettings = field(default_factory=QPSettings)
     staleness: StalenessPolicy = field(default_factory=StalenessPolicy)
@@ -132,7 +139,11 @@ class Settings:
         as_count("max_iterations", self.max_iterations)
         as_count("multi_start_interval", self.multi_start_interval)
         as_count("max_candidates", self.max_candidates)
-        if self.deadline is not None:
+        as_count("max_programs", self.max_programs)
+        as_count("max_replayed", self.max_replayed)
+        if isinstance(self.deadline, str) and self.deadline != "dt":
+            raise InvalidArgumentError("deadline", f"{self.deadline!r} is not 'dt'")
+        if self.deadline is not None and not isinstance(self.deadline, str):
             require_positive("deadline", self.deadline)
         require_flags(self, "multi_start", "history")
         if not isinstance(self.solver, str):
@@ -141,6 +152,10 @@ class Settings:
             raise InvalidArgumentError("qp", f"{self.qp!r} is not a QPSettings")
         if not isinstance(self.staleness, StalenessPolicy):
             raise InvalidArgumentError("staleness", f"{self.staleness!r} is not a StalenessPolicy")
+
+    def time_limit(self, dt: float | None = None) -> float | None:
+        """The deadline [s] of a step in a loop with interval dt [s], or in none; None for never."""
+        return dt if isinstance(self.deadline, str) else self.deadline
 
 
 def require_positive(argument: str, value: float) -> None:

@@ -116,6 +116,10 @@ def refuse_limits(problem: Problem) -> None:
             "problem.nodes_per_interval",
             f"{problem.nodes_per_interval}, but peers constrain the samples only",
         )
+    if problem.speed_max is not None:
+        raise InvalidArgumentError(
+            "problem.speed_max", f"{problem.speed_max}, but peers do not bound the speed"
+        )
     if problem.limits_states:
         at = int(problem.bounded_states[0])
         name = "x_max" if np.isfinite(problem.x_max[at]) else "x_min"

@@ -22,6 +22,7 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.propagation import positive_part
 from scp_mpc.problem import Problem
+from scp_mpc.scp.braking import braking
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
@@ -49,7 +50,7 @@ class Backup:
         start, table = np.zeros(problem.model.dim), [(0.0, 0.0, 0.0)]
         for speed in _SPEEDS:
             x = problem.model.state(start, speed * np.eye(len(start))[0])
-            stop, states = self._fallback.stopping(x)
+            stop, states = self.stopping(x)
             path = states[:, problem.model.position]
             if not (np.isfinite(path).all() and self._rests(path, len(stop))):
                 break
@@ -78,7 +79,7 @@ class Backup:
 
     def stopping(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Inputs (k, nu) that bring the robot to rest from x, and states (k+1, nx)."""
-        return self._fallback.stopping(x)
+        return braking(self._problem, x)
 
     def _is_far(self, end: FloatArray, obstacles: Sequence[ObstaclePrediction]) -> bool:
         """Whether no obstacle can be met while braking, from the last two positions (2, d)."""

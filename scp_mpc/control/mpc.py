@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.backup import Backup
 from scp_mpc.control.obstacle_memory import ObstacleMemory, Recall
-from scp_mpc.deadline import Clock
+from scp_mpc.deadline import Clock, Timer
 from scp_mpc.errors import ConcurrentUseError
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import ROUNDING, Problem
@@ -39,14 +39,19 @@ class MPC:
     Args:
         problem: What to solve at each step.
         settings: How to solve it.
+        timer: Tells the time [s] to deadlines; None for the machine's clock.
 
     Attributes:
-        overruns: Steps whose plan took longer than `settings.deadline`, since `reset`.
+        overruns: Steps whose plan took longer than the deadline, since `reset`.
+        replayed: Steps in a row, up to now, that live on an old plan or brake for want of time.
     """
 
-    def __init__(self, problem: Problem, settings: Settings | None = None) -> None:
+    def __init__(
+        self, problem: Problem, settings: Settings | None = None, timer: Timer | None = None
+    ) -> None:
         """Set up the solver; there is no plan yet."""
-        self._solver = SCP(problem, settings)
+        self._solver = SCP(problem, settings, timer)
+        self._deadline = self.settings.time_limit(self.problem.model.dt)
         self._memory = ObstacleMemory(
             self.settings.staleness, problem.model.dt, problem.max_obstacles
         )
@@ -62,7 +67,7 @@ class MPC:
         self._steps_touching = 0
         self._obstacles: tuple[ObstaclePrediction, ...] = ()
         self._counts.clear()
-        self.overruns = 0
+        self.overruns = self.replayed = 0
         self._memory.reset()
 
     @property
@@ -121,7 +126,7 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
-        clock = self._solver.clock()
+        clock = self._solver.timed(self._deadline)
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)
@@ -177,6 +182,7 @@ class MPC:
             return self._solver.solve_from(
                 *(x0, x_ref, recall.obstacles, self.nominal(), due),
                 *(robot_covariance, clock, last),
+                tired=self.replayed >= self.settings.max_replayed,
             )
         if self.settings.staleness.beyond == "refuse":
             raise recall.stale
@@ -233,8 +239,9 @@ class MPC:
         self._obstacles = recall.obstacles
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
         self._counts[plan.status] += 1
-        deadline = self.settings.deadline
-        if deadline is not None and plan.timing.total > deadline:
+        old = plan.status in (Status.PREVIOUS, Status.BRAKING)
+        self.replayed = self.replayed + 1 if old else 0
+        if self._deadline is not None and plan.timing.total > self._deadline:
             self.overruns += 1
 
     def _shifted(self) -> Iterate:

@@ -199,7 +199,8 @@ def disturbed(problem: Problem, model: Disturbed) -> Problem:
     Q, Qf = (np.pad(weight, (0, model.nw)) for weight in (problem.Q, problem.Qf))
     free = np.full(model.nw, np.inf)
     x_min, x_max = np.append(problem.x_min, -free), np.append(problem.x_max, free)
-    return replace(problem, model=model, Q=Q, Qf=Qf, x_min=x_min, x_max=x_max)
+    x_soft = np.append(problem.x_soft, np.zeros(model.nw, dtype=np.bool_))
+    return replace(problem, model=model, Q=Q, Qf=Qf, x_min=x_min, x_max=x_max, x_soft=x_soft)
 
 
 def _sum(first: FloatArray | None, second: FloatArray | None) -> FloatArray | None:

@@ -53,6 +53,7 @@ class KinematicBicycle(ComponentModel):
     nu = 2
     heading = 2
     position = indices(0, 1)
+    velocity = indices(3)
 
     def __post_init__(self) -> None:
         """Check the numbers."""

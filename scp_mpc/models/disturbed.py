@@ -57,7 +57,7 @@ class Disturbed(LinearModel):
         nw = E.shape[1]
         A = np.block([[nominal.A, E], [np.zeros((nw, nominal.nx)), alpha * np.eye(nw)]])
         B = np.concatenate([nominal.B, np.zeros((nw, nominal.nu))])
-        super().__init__(A, B, nominal.dt, nominal.position)
+        super().__init__(A, B, nominal.dt, nominal.position, nominal.velocity)
         for name, value in {"nominal": nominal, "alpha": alpha, "E": E}.items():
             object.__setattr__(self, name, value)
 

@@ -32,6 +32,7 @@ class DoubleIntegrator(LinearModel):
             B=np.kron(axes, np.array([[dt**2 / 2], [dt]])),
             dt=dt,
             position=np.arange(0, 2 * dim, 2),
+            velocity=np.arange(1, 2 * dim, 2),
         )
 
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:

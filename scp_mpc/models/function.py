@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_count, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
 from scp_mpc.models.coasting import coasting_state, coasting_stop
-from scp_mpc.models.model import Linearisation, Model, as_period, as_places, differences, joined
+from scp_mpc.models.model import (
+    Linearisation,
+    Model,
+    as_period,
+    as_places,
+    as_velocity,
+    differences,
+    joined,
+)
 from scp_mpc.models.runge_kutta import ContinuousModel
 
 Function = Callable[[FloatArray, FloatArray], Any]
@@ -38,6 +46,7 @@ class FunctionModel(ContinuousModel):
         position: Indices of the position within the state, 2 or 3.
         discrete: g is the next state.
         heading: Index of the heading within the state, for a planar robot that has one.
+        velocity: Indices of the velocity within the state, see `Model`; None where it holds none.
         equilibrium_input: Input (nu,) to start plans from; zeros if None.
         vectorised: Both functions take (..., nx) and (..., nu); otherwise they are looped over.
         substeps: Runge-Kutta steps per interval.
@@ -65,6 +74,7 @@ class FunctionModel(ContinuousModel):
         position: ArrayLike,
         discrete: bool = False,
         heading: int | None = None,
+        velocity: ArrayLike | None = None,
         equilibrium_input: ArrayLike | None = None,
         vectorised: bool = False,
         substeps: int = 1,
@@ -88,6 +98,7 @@ class FunctionModel(ContinuousModel):
             if not callable(given) and (given is not None or name == "function"):
                 raise InvalidArgumentError(name, f"{given!r} is not a function")
         self.heading, self.discrete = heading, bool(discrete)
+        self.velocity = as_velocity(velocity, self._nx, len(self.position))
         self.equilibrium_input = frozen(
             as_array(
                 "equilibrium_input",

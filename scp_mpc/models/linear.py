@@ -16,7 +16,7 @@ from scipy.linalg import fractional_matrix_power
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
-from scp_mpc.models.model import Linearisation, Model, as_period, as_places
+from scp_mpc.models.model import Linearisation, Model, as_period, as_places, as_velocity
 
 _MOST_POWERS = 64
 
@@ -30,6 +30,7 @@ class LinearModel(Model):
         B: (nx, nu) input matrix.
         dt: Sampling time [s].
         position: Indices (d,) of the position's coordinates within the state, d = 2 or 3.
+        velocity: Indices of the velocity within the state; see `Model`.
 
     Raises:
         ShapeError: A is not square, or B has another number of rows.
@@ -41,6 +42,7 @@ class LinearModel(Model):
     B: FloatArray
     dt: float
     position: IntArray
+    velocity: IntArray | None = None
 
     def __post_init__(self) -> None:
         """Copy, check and freeze the matrices."""
@@ -56,6 +58,8 @@ class LinearModel(Model):
         object.__setattr__(self, "B", frozen(B))
         object.__setattr__(self, "dt", dt)
         object.__setattr__(self, "position", position)
+        velocity = as_velocity(self.velocity, len(A), len(position))
+        object.__setattr__(self, "velocity", velocity)
 
     @property
     def nx(self) -> int:

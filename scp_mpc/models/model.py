@@ -47,11 +47,14 @@ class Model(ABC):
         position: Indices (d,) of the position's coordinates within the state, d = 2 or 3.
         heading: Index within the state of the angle that the robot's nose points at [rad], for a
             planar robot that has one.
+        velocity: Indices within the state of the velocity [m/s]: (d,) along the axes, or (1,) of a
+            signed speed along the heading; None where the state holds neither.
     """
 
     dt: float
     position: IntArray
     heading: int | None = None
+    velocity: IntArray | None = None
 
     @property
     @abstractmethod
@@ -194,6 +197,23 @@ def as_places(position: object, nx: int) -> IntArray:
     if not whole or len(set(array.tolist()) & set(range(nx))) < len(array):
         raise InvalidArgumentError(
             "position", f"{position!r} is not 2 or 3 distinct indices below {nx}"
+        )
+    return indices(*array.tolist())
+
+
+def as_velocity(velocity: object, nx: int, dim: int) -> IntArray | None:
+    """Return the indices of the velocity within the state, or None.
+
+    Raises:
+        InvalidArgumentError: They are not one index, or one per axis, below nx.
+    """
+    if velocity is None:
+        return None
+    array = np.array(velocity)
+    whole = array.dtype.kind in "iu" and array.shape in ((1,), (dim,))
+    if not whole or len(set(array.tolist()) & set(range(nx))) < len(array):
+        raise InvalidArgumentError(
+            "velocity", f"{velocity!r} is not one or {dim} distinct indices below {nx}"
         )
     return indices(*array.tolist())
 

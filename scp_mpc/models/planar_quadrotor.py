@@ -46,6 +46,7 @@ class PlanarQuadrotor(ComponentModel):
     nx = 6
     nu = 2
     position = indices(0, 1)
+    velocity = indices(3, 4)
 
     def __post_init__(self) -> None:
         """Check the numbers."""

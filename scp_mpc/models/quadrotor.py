@@ -51,6 +51,7 @@ class Quadrotor(ComponentModel):
     nx = 9
     nu = 4
     position = indices(0, 1, 2)
+    velocity = indices(3, 4, 5)
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -51,6 +51,7 @@ class Unicycle(Model):
     nu = 2
     heading = 2
     position = indices(0, 1)
+    velocity = indices(3)
 
     def __post_init__(self) -> None:
         """Check dt."""

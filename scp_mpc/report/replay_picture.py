@@ -83,7 +83,8 @@ def _draw_clearance(axes: Axes, run: Run, meetings: Sequence[Meeting]) -> None:
             label = f"closest to one person, {how}"
             axes.plot(*np.transpose(some), "o", color=color, markersize=4, label=label)
     for number, o in enumerate(meetings[:_SHOWN], 1):
-        axes.text(o.time, o.clearance - 0.07, str(number), ha="center", va="top", fontsize=9)
+        if o.clearance < _HIGHEST:  # a text beyond the axes takes their place
+            axes.text(o.time, o.clearance - 0.07, str(number), ha="center", va="top", fontsize=9)
     axes.set_ylim(min(-0.3, nearest.min() - 0.25), _HIGHEST + 0.1)
     axes.set_xlim(0.0, run.times[-1])
     axes.set_xlabel("time [s]")

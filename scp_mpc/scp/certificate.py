@@ -50,7 +50,7 @@ class Nominal:
         planes: Their constraints, linearised here.
         force: (K,) lambda.
         slack: (K,) violation of the pairs that yield [m].
-        excess: (N nb,) how far the bounded states exceed their bounds.
+        excess: (N nb,) how far what is bounded of the states exceeds its bounds.
         cost: Objective without slack.
         residuals: KKT residuals of the original problem.
     """
@@ -135,6 +135,7 @@ class Certificate:
         force: FloatArray,
         slack: FloatArray,
         bounds: tuple[FloatArray, FloatArray],
+        wide: tuple[FloatArray, FloatArray],
     ) -> Nominal:
         """Return the plan with its residuals.
 
@@ -147,6 +148,7 @@ class Certificate:
             force: (K,) forces of the obstacles.
             slack: (K,) violation of those that yield [m].
             bounds: Of y in this step.
+            wide: The same, as far as its program took those of states.
         """
         problem, c = self._problem, self._layout
         u, e, w = rollout.inputs, rollout.deviations, problem.size.weight
@@ -175,9 +177,12 @@ class Certificate:
             allowed = np.zeros(len(boxed))
             if c.size > c.u.stop:  # only changes and states can be beyond their bounds
                 beyond = np.maximum(0.0, -np.minimum(below, above))
-                excess = beyond[c.relaxable]
-                yields = np.abs(reaction[c.relaxable]) >= problem.state_slack_weight
-                allowed[c.relaxable] = np.where(yields, excess, 0.0)
+                excess = beyond[c.states]
+                if wide is not bounds:
+                    low, high = (lower - wide[0])[c.boxed], (wide[1] - upper)[c.boxed]
+                    allowed = np.minimum(beyond, np.where(below < 0, low, high))
+                yields = np.abs(reaction[c.soft]) >= problem.state_slack_weight
+                allowed[c.soft] = np.where(yields, beyond[c.soft], 0.0)
                 feasibility = max(feasibility, float((beyond - allowed).max()))
             pushing = reaction != 0
             if pushing.any():

@@ -296,7 +296,7 @@ class Condenser:
         L = _factor(flat.T @ weighed + self._effort)
         inverse, _ = dtrtri(L, lower=1)
         back = np.ascontiguousarray(inverse.T)
-        bounded = G[:, problem.bounded_states].reshape(-1, inputs) @ back
+        bounded = (problem.state_rows @ G).reshape(-1, inputs) @ back
         moved = along.moved(G, np.eye(inputs).reshape(N, nu, inputs))
         S = layout.response(moved @ back, back, bounded)
         unbox = np.zeros((layout.variables, layout.variables))  # columns: sizes first, as in y

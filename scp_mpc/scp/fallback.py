@@ -3,19 +3,24 @@
 1. the certified plan       2. a feasible iterate
 3. the last plan, shifted: its inputs from the state now, rechecked against the new predictions
 4. braking at the model's limits, checked likewise
-5. whatever violates least
+5. the plan with slack, or as much of it as leaves time to brake before it violates anything
+6. braking, whatever is in the way
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.scp.braking import braking, resting_input
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Result, Status
 from scp_mpc.scp.step import Step
 
-_AT_REST = 1e-9  # of an input, in its own unit, that is none
+_AT_REST = 0.05  # [m/s] at which a robot counts as standing
+_STANDS = 0.3  # [m/s] up to which an obstacle does, whose velocity is estimated
 
 
 class Fallback:
@@ -29,27 +34,74 @@ class Fallback:
     def __init__(self, problem: Problem, tolerance: float) -> None:
         """Remember both."""
         self._problem, self._tolerance = problem, tolerance
-        self._rest = np.clip(problem.model.equilibrium_input, problem.u_min, problem.u_max)
 
-    def best(self, step: Step, last: Iterate | None) -> Result:
-        """The last plan, if it meets every constraint; else braking, whether it does or not."""
+    def best(self, step: Step, last: Iterate | None, tired: bool = False) -> Result:
+        """The last plan, if it meets every constraint; else braking, whether it does or not.
+
+        Braking comes first for one who is `tired` of the last plan, if that meets them all.
+        """
+        if tired:
+            brake = self.brake(step)
+            if brake.status.ok or last is None:
+                return brake
         kept = None if last is None else self.keep(step, last.inputs)
         return kept if kept is not None and kept.status.ok else self.brake(step)
 
-    def lesser(self, found: Result, braking: Result) -> Result:
-        """Of two plans with a violation, a certified one, else the one with less.
+    def stopping(self, step: Step, *plans: Result | None) -> Result:
+        """The first plan, or the longest head of one followed by braking, that is passively safe.
 
-        The largest slack and the largest excess of a state count at their prices.
+        Passively safe is who violates nothing, or no faster than full braking from now on would
+        be at that time: whoever is in the way then finds the robot at rest, or as slow as can be
+        (passive motion safety: Macek, Vasquez, Fraichard and Siegwart, 2009). What stands and is
+        entered already may be left. Braking alone always is safe in this sense; whether it comes
+        to rest in time is what its status says.
+
+        Args:
+            step: The step.
+            plans: With slack, or not feasible, in order of preference.
         """
-        if found.status.certified:
-            return found
-        return found if self._violation(found) <= self._violation(braking) else braking
+        problem, brake = self._problem, self.brake(step)
+        known = [plan for plan in plans if plan is not None]
+        for plan in known:
+            if self._is_passive(step, plan, brake):
+                return plan if plan.status.certified else replace(plan, status=Status.STOPPING)
+        head = problem.horizon
+        while head > 1:
+            head //= 2
+            for plan in known:
+                inputs = plan.iterate.inputs[:head]
+                stop = braking(problem, plan.iterate.states[head], inputs[-1])[0]
+                rest = np.tile(resting_input(problem), (problem.horizon, 1))
+                whole = np.concatenate([inputs, stop, rest])[: problem.horizon]
+                tried = self._judged(step, whole, Status.STOPPING)
+                if self._is_passive(step, tried, brake):
+                    return tried
+        deep = self._stages(step, brake).max(axis=0, initial=0.0) > self._tolerance
+        if (self._ways(brake)[deep] <= _AT_REST * problem.model.dt).all():
+            return replace(brake, status=Status.STOPPING)
+        return brake
 
-    def _violation(self, end: Result) -> float:
-        problem, iterate = self._problem, end.iterate
-        most = problem.slack_weight * float(iterate.slack.max(initial=0.0))
-        most += problem.state_slack_weight * float(problem.excess(iterate.states).max())
-        return np.inf if np.isnan(most) else most
+    def _is_passive(self, step: Step, plan: Result, brake: Result) -> bool:
+        """Whether a plan is as slow as braking where it violates anything, or leaves it."""
+        excess, tolerance = step.hard_excess, self._tolerance
+        if excess(plan.iterate.states) > excess(brake.iterate.states) + tolerance:
+            return False
+        depths, dt = self._stages(step, plan), self._problem.model.dt
+        slow = self._ways(plan) <= self._ways(brake) + _AT_REST * dt
+        leaves = depths <= self._stages(step, brake) + tolerance
+        leaves[:, 1:] &= depths[:, 1:] <= depths[:, :-1] + tolerance
+        means = step.means[:, :: step.nodes.count]
+        stands = np.linalg.norm(np.diff(means, axis=1), axis=2).max(axis=1) <= _STANDS * dt
+        return bool(((depths <= tolerance) | slow | (leaves & stands[:, None])).all())
+
+    def _stages(self, step: Step, plan: Result) -> FloatArray:
+        """How deep (J, N) a plan enters the no-go sets in each interval [m]."""
+        return step.nodes.stages(plan.iterate.slack[: step.count]).max(axis=2, initial=0.0)
+
+    def _ways(self, plan: Result) -> FloatArray:
+        """How far the robot goes in each interval (N,) [m]."""
+        path = plan.iterate.states[:, self._problem.model.position]
+        return np.linalg.norm(np.diff(path, axis=0), axis=1)
 
     def keep(self, step: Step, inputs: FloatArray) -> Result:
         """Roll the last plan's inputs (N, nu) out from the state now."""
@@ -58,40 +110,13 @@ class Fallback:
     def brake(self, step: Step, status: Status = Status.BRAKING) -> Result:
         """Bring the robot to rest, as hard as the bounds allow, in the direction it moves."""
         problem = self._problem
-        U, stop = np.tile(self._rest, (problem.horizon, 1)), self.stopping(step.x0, step.u_last)[0]
+        U, stop = np.tile(resting_input(problem), (problem.horizon, 1)), step.braking[0]
         U[: len(stop)] = stop
         return self._judged(step, problem.limited(U, step.u_last), status)
-
-    def stopping(
-        self, x: FloatArray, last: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Inputs (k, nu) that bring the robot to rest from x, k <= N, and states (k+1, nx)."""
-        problem, inputs, states = self._problem, [], [x]
-        for _ in range(problem.horizon):
-            stop = self._stop(states[-1])
-            if stop is None:
-                break
-            last = problem.limited(stop[None], last)[0]
-            inputs.append(last)
-            states.append(problem.model.step(states[-1], last))
-        return np.array(inputs).reshape(-1, problem.model.nu), np.array(states)
 
     def depths(self, step: Step, inputs: FloatArray) -> FloatArray:
         """How deep (J, C) [m] a plan enters the no-go sets, by its own motion between the nodes."""
         return self._judged(step, inputs, Status.PREVIOUS).iterate.slack[: step.count]
-
-    def _stop(self, x: FloatArray) -> FloatArray | None:
-        """The input (nu,) that stops the robot, as far as the bounds allow; None at rest."""
-        problem, rest = self._problem, self._rest
-        wanted = problem.model.stopping_input(x) - rest
-        if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
-            return None
-        # In the direction of what is wanted; inputs without any room stay where they are.
-        room = np.where(wanted > 0, problem.u_max - rest, problem.u_min - rest)
-        none = np.abs(room) <= _AT_REST
-        wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
-        stop: FloatArray = rest + wanted / max(1.0, float((wanted / room).max()))
-        return stop
 
     def _judged(self, step: Step, inputs: FloatArray, status: Status) -> Result:
         """The trajectory of inputs with its true violation; FALLBACK where there is any."""
@@ -111,7 +136,7 @@ class Fallback:
             step = step.widened(step.nodes.radii(step.radii, step.drift, motion))
         slack = np.zeros((problem.max_obstacles, step.nodes.size))
         slack[: step.count] = step.depths(step.nodes.positions(states, inputs), s)
-        most = float(np.maximum(slack.max(initial=0.0), problem.excess(states).max()))  # or NaN
+        most = float(np.maximum(slack.max(initial=0.0), step.excess(states)))  # or NaN
         if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
         cost = problem.cost(states, inputs, s, step.x_ref)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, frozen
-from scp_mpc.deadline import Clock, Pace
+from scp_mpc.deadline import Clock, Pace, Timer
 from scp_mpc.errors import ConcurrentUseError, InvalidArgumentError
 from scp_mpc.geometry.margin import JointRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -53,25 +53,28 @@ class SCP:
     Args:
         problem: What to solve.
         settings: How to solve it.
+        timer: Tells the time [s] to deadlines; None for the machine's clock.
 
     Raises:
         InvalidArgumentError: There is no solver of that name, or it is not installed.
     """
 
-    def __init__(self, problem: Problem, settings: Settings | None = None) -> None:
+    def __init__(
+        self, problem: Problem, settings: Settings | None = None, timer: Timer | None = None
+    ) -> None:
         """Condense the problem, lay the programs out and set the solvers up."""
         self.problem = problem
         self.settings = Settings() if settings is None else settings
         if not isinstance(self.settings, Settings):
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
-        self._busy, self._pace = Lock(), Pace()
+        self._busy, self._pace, self._timer = Lock(), Pace(), timer
         self._nodes = Nodes.of(problem)
         self._at = Transcription(problem, self.settings, self._nodes)
         self._loop = Loop(self._at)
         self._multi_start = MultiStart(self._at, self._loop)
         self._fallback = Fallback(problem, self.settings.tolerance)
         self._between = problem.nodes_per_interval > 1
-        if self.settings.deadline is not None:
+        if self.settings.time_limit() is not None:
             self._warm_up()
 
     def solve(
@@ -118,8 +121,13 @@ class SCP:
         robot_covariance: ArrayLike | None = None,
         clock: Clock | None = None,
         u_last: ArrayLike | None = None,
+        tired: bool = False,
     ) -> Plan:
-        """`solve`, with an iterate that is known to fit, and a clock that may run."""
+        """`solve`, with an iterate that is known to fit, and a clock that may run.
+
+        Where nothing better is found in time, the last plan is followed unless one is `tired` of
+        it: then braking comes first.
+        """
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
@@ -128,10 +136,10 @@ class SCP:
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
             )
             try:
-                return self._solve(step, clock, nominal, multi_start)
+                return self._solve(step, clock, nominal, multi_start, tired)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
-                return self._plan(step, Found(self._fallback.best(step, nominal)), clock)
+                return self._plan(step, Found(self._fallback.best(step, nominal, tired)), clock)
         finally:
             self._busy.release()
 
@@ -210,8 +218,12 @@ class SCP:
         return self._plan(step, Found(self._fallback.keep(step, inputs)), Clock())
 
     def clock(self) -> Clock:
-        """The clock of a step that begins now."""
-        return Clock(self.settings.deadline, self._pace)
+        """The clock of a step that begins now, in no loop."""
+        return self.timed(self.settings.time_limit())
+
+    def timed(self, deadline: float | None) -> Clock:
+        """The clock of a step that begins now and is to end by a deadline [s]."""
+        return Clock(deadline, self._pace, self.settings.max_programs, self._timer)
 
     def _warm_up(self) -> None:
         """Solve some steps with everybody in the way: first calls are slow, and paces unknown."""
@@ -228,7 +240,9 @@ class SCP:
                 way[0], way, [ObstaclePrediction(m, 0.01 * np.eye(model.dim), 0.1) for m in means]
             )
 
-    def _solve(self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool) -> Plan:
+    def _solve(
+        self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool, tired: bool
+    ) -> Plan:
         at = self._at
         at.begin(step, clock)
         free = self._obstacle_free(last)
@@ -252,7 +266,7 @@ class SCP:
             best = None
             if step.count and clock.allows("iteration"):
                 best = self._loop.run(at.at(start, about=about), about=about)
-            found = Found(best or self._fallback.best(step, last))
+            found = Found(best or self._fallback.best(step, last, tired))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
             if isinstance(self.problem.margin, JointRisk):
@@ -266,7 +280,7 @@ class SCP:
                 break
             start, about = found.best.iterate, None
         else:
-            known = self._fallback.best(step, last)
+            known = self._fallback.best(step, last, tired)
             best = known if known.status.ok else self._exposed(step, found.best)
             found = replace(found, best=best)
         plan = self._plan(at.step, found, clock)
@@ -309,11 +323,12 @@ class SCP:
 
         What is known is judged by its own motion between the nodes, and so is what it leads to.
         """
-        if best.status.ok or best.status is Status.FALLBACK:
+        if best.status.ok:
             return best
         known = self._fallback.best(step, last)
         if not known.status.ok:
-            return self._fallback.lesser(best, known)
+            kept = None if last is None else self._fallback.keep(step, last.inputs)
+            return self._fallback.stopping(step, best, kept)
         own = self._motion(known.iterate)
         self._at.step = self._widened(step, own) if self._between else step
         better = self._loop.run(self._at.at(known.iterate))

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,9 +22,13 @@ from scp_mpc.geometry.polytopes import Polytopes
 from scp_mpc.geometry.risk import risk_bound
 from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.problem import Problem
+from scp_mpc.scp.braking import braking
 from scp_mpc.scp.nodes import Nodes
 
+Braked = Literal["none", "outside", "all"]
+
 _TOUCH = 1e-9  # [m] within another body that is not
+_OUTSIDE = 1e-9  # of a bound, in its own unit, that is not
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
 
 
@@ -165,6 +170,57 @@ class Step:
     def here(self) -> FloatArray:
         """(d,) the robot's position now: positions are counted from there, wherever that is."""
         return self.x0[self.problem.model.position]
+
+    @cached_property
+    def braking(self) -> tuple[FloatArray, FloatArray]:
+        """Inputs (k, nu) that bring the robot to rest from now on, and states (k+1, nx)."""
+        return braking(self.problem, self.x0, self.u_last)
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the state now is outside of hard bounds."""
+        low, high = self._outside()
+        return bool(low.any() or high.any())
+
+    def _outside(self) -> tuple[BoolArray, BoolArray]:
+        """Which hard rows (nb,) are below their bounds now, and which are above."""
+        (lower, upper), hard = self.problem.row_bounds, ~self.problem.soft_rows
+        here = self.problem.state_rows @ self.x0
+        return hard & (here < lower - _OUTSIDE), hard & (here > upper + _OUTSIDE)
+
+    def row_bounds(self, braked: Braked = "none") -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds (N, nb) of E x at stages 1 .. N, E = `Problem.state_rows`.
+
+        Args:
+            braked: Which of the hard ones go as far as full braking does: none, those that are
+                outside their bounds now, or all.
+        """
+        problem, rows = self.problem, self.problem.state_rows
+        lower, upper = (np.tile(bound, (problem.horizon, 1)) for bound in problem.row_bounds)
+        if braked == "none":
+            return lower, upper
+        low, high = self._outside()
+        if braked == "all":
+            low = high = ~problem.soft_rows
+        if low.any() or high.any():
+            states = self.braking[1][1:] if len(self.braking[0]) else self.x0[None]
+            after = np.full((problem.horizon, len(rows)), rows @ states[-1])
+            after[: len(states)] = states @ rows.T
+            lower = np.where(low, np.minimum(lower, after), lower)
+            upper = np.where(high, np.maximum(upper, after), upper)
+        return lower, upper
+
+    def excess(self, states: FloatArray) -> float:
+        """By how much states (N+1, nx) are outside the bounds of E x at most; 0 for nowhere."""
+        return float(self._excesses(states).max(initial=0.0))  # or NaN
+
+    def hard_excess(self, states: FloatArray) -> float:
+        """The same of rows that must not yield."""
+        return float(self._excesses(states)[:, ~self.problem.soft_rows].max(initial=0.0))
+
+    def _excesses(self, states: FloatArray) -> FloatArray:
+        (lower, upper), after = self.row_bounds(), states[1:] @ self.problem.state_rows.T
+        return np.maximum(lower - after, after - upper)
 
     def path(self, away: FloatArray) -> FloatArray:
         """Positions (C+1, d) [m] from now on, given those of the nodes (C d,) relative to now."""

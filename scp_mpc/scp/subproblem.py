@@ -12,8 +12,8 @@ Only this file knows the order of its variables and rows:
 There is a fixed number of slots for half-spaces at each node, for the nearest obstacles; empty ones
 hold zeros. Near pairs beyond that are in the condensed program only, against which `active_set.py`
 checks whatever OSQP says, and join there where they must. A hard program has no slack; an elastic
-one has below and above for bounded states and slack for half-spaces, each at its price per unit:
-the exact L1 penalty. OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w), to which
+one has below and above for soft states and slack for half-spaces, each at its price per unit: the
+exact L1 penalty. OSQP's 1/2 against our none makes P = 2 diag(Q, .., Qf, R, .., w), to which
 curvature may be added stage by stage.
 
 Notation:
@@ -38,6 +38,7 @@ from scp_mpc.settings import Settings
 
 _NONE = 1e29  # a bound beyond this is none
 _SLOTS = 3  # for half-spaces at each node; more gain nothing
+_ELASTIC_SLOTS = 10  # with fewer, a crowd's programs with slack are not solved
 _COUPLING = 0.1  # of slack to its row, relative to the row's length: more hides the active set
 
 
@@ -49,7 +50,7 @@ class Subproblem:
         nodes: Where its plans are constrained.
         layout: What y holds.
         settings: Who solves the program.
-        elastic: Whether bounded states and half-spaces may yield.
+        elastic: Whether soft states and half-spaces may yield.
 
     Attributes:
         program: The values as last written.
@@ -63,9 +64,9 @@ class Subproblem:
         """Lay out variables and rows, and set up the solvers."""
         self._problem, self._nodes, self._layout, self.elastic = problem, nodes, layout, elastic
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
-        self._slots = min(M, _SLOTS)
+        self._slots = min(M, _ELASTIC_SLOTS if elastic else _SLOTS)
         spaces = nodes.size * self._slots
-        states = N * len(problem.bounded_states) if elastic else 0
+        states = len(layout.soft) if elastic else 0
         columns = [N * model.nx, N * model.nu, layout.moving, states, states]
         columns.append(spaces if elastic else 0)
         self._e, self._u, self._s, self._below, self._above, self._slack = _slices(columns)
@@ -117,7 +118,7 @@ class Subproblem:
         below, above = program.lower[self._bounded], program.upper[self._bounded]
         below[:] = np.where(lower <= -_NONE, -np.inf, lower)
         above[:] = np.where(upper >= _NONE, np.inf, upper)
-        if u_last is not None and self._layout.relaxable.start > rates:
+        if u_last is not None and self._layout.states.start > rates:
             below[rates : rates + len(u_last)] += u_last
             above[rates : rates + len(u_last)] += u_last
 
@@ -171,8 +172,8 @@ class Subproblem:
         below, above = np.full((2, nf + K), -1, dtype=np.intp)
         states = self._below.stop - self._below.start
         if states:
-            below[layout.relaxable] = self._pins.start + np.arange(states)
-            above[layout.relaxable] = self._pins.start + states + np.arange(states)
+            below[layout.soft] = self._pins.start + np.arange(states)
+            above[layout.soft] = self._pins.start + states + np.arange(states)
         if relaxable:
             below[nf + kept] = self._pins.start + 2 * states + slot
         data[self._places["slack"]] = self._coupling[1] * relaxable
@@ -200,7 +201,7 @@ class Subproblem:
             price, states = self._problem.slack_weight, self._below.stop - self._below.start
             pins = np.zeros(self._pins.stop - self._pins.start)
             if states:
-                toll, pull = self._problem.state_slack_weight, force[self._layout.relaxable]
+                toll, pull = self._problem.state_slack_weight, force[self._layout.soft]
                 pins[:states] = -np.maximum(toll - pull, 0.0) * self._coupling[0]
                 pins[states : 2 * states] = -np.maximum(toll + pull, 0.0) * self._coupling[0]
             spaces = y[self._spaces]
@@ -210,7 +211,7 @@ class Subproblem:
             short, over = self.program.lower - values, values - self.program.upper
             z[self._slack] = np.maximum(short[self._spaces], 0.0) / self._coupling[1]
             if states:
-                held = slice(self._bounded.stop - states, self._bounded.stop)
+                held = self._bounded.start + self._layout.soft
                 z[self._below] = np.maximum(short[held], 0.0) / self._coupling[0]
                 z[self._above] = np.maximum(over[held], 0.0) / self._coupling[0]
         return z, y
@@ -234,10 +235,11 @@ class Subproblem:
         data[self._places["A"]], data[self._places["B"]] = -A[1:].ravel(), -B.ravel()
 
     def _couplings(self) -> tuple[FloatArray, float]:
-        """Coefficients of slack: (N nb,) of bounded states, and of half-spaces."""
+        """Coefficients of slack: of soft states at all stages, and of half-spaces."""
         problem = self._problem
         length = 1 / np.sqrt(np.where(np.diag(problem.Q) > 0, 2 * np.diag(problem.Q), 1.0))
-        states = np.tile(_COUPLING * length[problem.bounded_states], problem.horizon)
+        soft = problem.bounded_states[problem.soft_rows[: len(problem.bounded_states)]]
+        states = np.tile(_COUPLING * length[soft], problem.horizon)
         states = states[: self._below.stop - self._below.start]
         return states, float(_COUPLING * length[problem.model.position].mean())
 
@@ -281,12 +283,14 @@ class Subproblem:
         sizes, inputs = np.arange(layout.moving), np.arange(N * model.nu)
         blocks.add("s", bounded + sizes, self._s.start + sizes, 1.0)
         blocks.add("u", bounded + layout.inputs.start + inputs, self._u.start + inputs, 1.0)
-        rates = np.arange(layout.inputs.stop, layout.relaxable.start)
+        rates = np.arange(layout.inputs.stop, layout.states.start)
         blocks.add("du", bounded + rates, self._u.start + np.arange(len(rates)), 1.0)
         later = rates[model.nu :]
         blocks.add("du before", bounded + later, self._u.start + np.arange(len(later)), -1.0)
-        states = bounded + np.arange(layout.relaxable.start, layout.relaxable.stop)
-        blocks.add("z", states, state[:, 0, problem.bounded_states].ravel(), 1.0)
+        which, entry = np.nonzero(problem.state_rows)
+        first = bounded + layout.states.start + len(problem.state_rows) * np.arange(N)[:, None]
+        values = np.tile(problem.state_rows[which, entry], N)
+        blocks.add("z", (first + which).ravel(), state[:, 0, entry].ravel(), values)
         inner = nodes.count - nodes.discs
         space = self._spaces.start + np.arange(nodes.size * S).reshape(N, nodes.count, S, 1)
         state, control = state[:, :, None], control[:, :, None]
@@ -304,7 +308,8 @@ class Subproblem:
             blocks.add("pins", pins, np.arange(self._below.start, self._slack.stop), 1.0)
             for name, part, sign in (("below", self._below, 1.0), ("above", self._above, -1.0)):
                 columns = np.arange(part.start, part.stop)
-                blocks.add(name, states[: len(columns)], columns, sign * self._coupling[0])
+                rows = bounded + layout.soft[: len(columns)]
+                blocks.add(name, rows, columns, sign * self._coupling[0])
             slack = np.arange(self._slack.start, self._slack.stop)
             blocks.add("slack", space.ravel(), slack, self._coupling[1])
         return blocks.build(shape)

@@ -28,10 +28,14 @@ _REPAIRS = 10  # of the bounds of a plan that ignores the obstacles
 _TOUCH = 1e-7  # distance to a constraint that counts as none
 _ROUNDING = 1e-10  # of a bounded entry, in its own unit
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
+_HARD = 10.0  # price of a hard state's excess in merits, times that of slack
 
 
 class Relaxation(IntEnum):
-    """Which constraints are relaxed where they cannot all be met."""
+    """Which constraints are relaxed where they cannot all be met.
+
+    STATES: soft states yield, the others as far as full braking takes them. ALL: obstacles, too.
+    """
 
     NONE = 0
     STATES = 1
@@ -93,15 +97,16 @@ class Transcription:
         )
         self._certificate = Certificate(problem, self.layout)
         self._full = np.full(problem.max_obstacles, problem.size.reference)
-        self._levels = [Relaxation.NONE, Relaxation.ALL]
-        if problem.limits_states:
-            self._levels.insert(1, Relaxation.STATES)
+        prices = problem.state_slack_weight, _HARD * problem.slack_weight
+        self._prices = np.tile(np.where(problem.soft_rows, *prices), problem.horizon)
 
     def begin(self, step: Step, clock: Clock) -> None:
         """Read a control step."""
         self.step, self.clock, self.obstacle_free = step, clock, None
         self.condenser.begin(step)
         self.bounds = self.layout.bounds(step)
+        self._near = self.layout.bounds(step, "outside") if step.is_outside else self.bounds
+        self._far: tuple[FloatArray, FloatArray] | None = None
         self.no_pairs = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
         for subproblem in (self.hard, self.elastic):
             subproblem.solver.finished, subproblem.about = Counter(), None
@@ -132,12 +137,13 @@ class Transcription:
         pairs: Pairs,
         force: FloatArray,
         relaxed: BoolArray | None = None,
+        relaxation: Relaxation = Relaxation.NONE,
     ) -> Nominal:
         """A plan with its residuals; see `Certificate.certify`. Nobody yields unless `relaxed`."""
         planes = pairs.planes(y)
         slack = np.zeros(len(force)) if relaxed is None else np.maximum(-planes.g, 0.0) * relaxed
         given = y, rollout, reaction, pairs, planes, force, slack
-        return self._certificate.certify(*given, self.bounds)
+        return self._certificate.certify(*given, self.bounds, self.relaxed_bounds(relaxation))
 
     def plain(self, inputs: FloatArray, guess: FloatArray | None = None) -> Nominal:
         """A plan of inputs (N, nu) on which nothing pushes, obstacles left out."""
@@ -178,7 +184,8 @@ class Transcription:
         """
         rest = np.tile(self.problem.model.equilibrium_input, (self.problem.horizon, 1))
         condensed = self.condenser.condensed(self.condenser.rolled(rest), self._full)
-        free, (lower, upper), box = condensed.y_free, self.bounds, self.layout.boxed
+        free, box = condensed.y_free, self.layout.boxed
+        lower, upper = self.relaxed_bounds(Relaxation.NONE)
         if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
             self.hard.solver.finished["kkt"] += 1
             return self.plain(free[self.layout.u].reshape(rest.shape))
@@ -206,9 +213,7 @@ class Transcription:
     def merit(self, cost: float, slack: float, excess: FloatArray) -> float:
         """Cost and the penalties on all slack [m] and on the states' excess."""
         merit = cost + self.problem.slack_weight * slack
-        if len(excess):
-            merit += self.problem.state_slack_weight * float(excess.sum())
-        return merit
+        return merit + float(self._prices @ excess) if len(excess) else merit
 
     # --- which obstacles are near
 
@@ -289,7 +294,7 @@ class Transcription:
         c, by = self.layout, condensed.by
         A = np.einsum("kw,kwn->kn", planes.a, pairs.rows(by.S))
         b = (planes.a * (planes.y - condensed.y_free)[pairs.at]).sum(axis=1) - planes.g
-        lower, upper = self.bounds[0][c.boxed], self.bounds[1][c.boxed]
+        lower, upper = (bound[c.boxed] for bound in self.relaxed_bounds(relaxation))
         if radius is not None:
             lower, upper, u = lower.copy(), upper.copy(), condensed.about.inputs.ravel()
             lower[c.inputs] = np.maximum(lower[c.inputs], u - radius)
@@ -297,7 +302,7 @@ class Transcription:
         l1_weight = None
         if relaxation is not Relaxation.NONE:
             l1_weight = np.full(len(lower) + len(b), np.inf)
-            l1_weight[c.relaxable] = self.problem.state_slack_weight
+            l1_weight[c.soft] = self.problem.state_slack_weight
             if relaxation is Relaxation.ALL:
                 l1_weight[len(lower) :] = self.problem.slack_weight
         free = condensed.y_free[c.boxed]
@@ -320,23 +325,35 @@ class Transcription:
 
     def next_relaxation(self, relaxation: Relaxation, hard: bool) -> Relaxation | None:
         """Who is to give way next; None if nobody is left: hard obstacles never do."""
-        more = [level for level in self._levels if level > relaxation]
-        if not more or (hard and more[0] is Relaxation.ALL):
-            return None
-        return more[0]
+        if relaxation is Relaxation.NONE and self._states_yield():
+            return Relaxation.STATES
+        return Relaxation.ALL if relaxation is not Relaxation.ALL and not hard else None
+
+    def relaxed_bounds(self, relaxation: Relaxation) -> tuple[FloatArray, FloatArray]:
+        """Bounds (ny,) of y in a program of some kind."""
+        if relaxation is Relaxation.NONE or not self.layout.limits_states:
+            return self._near
+        if self._far is None:
+            self._far = self.layout.bounds(self.step, "all")
+        return self._far
+
+    def _states_yield(self) -> bool:
+        far = self.relaxed_bounds(Relaxation.STATES)
+        return len(self.layout.soft) > 0 or not all(map(np.array_equal, self._near, far))
 
     def certify(self, program: Program, solution: QPSolution) -> Nominal:
         """Roll a solution out and certify it against the original problem."""
         nf, condensed, c = len(program.qp.F), program.condensed, self.layout
         y = condensed.y(solution.v)
         boxed = y[c.boxed]
-        for bound in self.bounds:  # bounds are met exactly, not nearly
+        for bound in self.relaxed_bounds(program.relaxation):  # met exactly, not nearly
             near = np.abs(boxed - bound[c.boxed]) <= _ROUNDING
             boxed[near] = bound[c.boxed][near]
         guess = None if self.linear else condensed.deviations(solution.v)
         y, rollout = self.rolled(y[c.u].reshape(c.shape), y[c.s], guess)
         force, relaxed = solution.force[nf:], solution.relaxed[nf:]
-        plan = self.nominal(y, rollout, solution.force[:nf], program.pairs, force, relaxed)
+        given = y, rollout, solution.force[:nf], program.pairs, force, relaxed, program.relaxation
+        plan = self.nominal(*given)
         self.clock.charge("linearise")
         return plan
 

@@ -153,7 +153,8 @@ def replay(
     """
     crossing = Crossing.through(recording, "along") if crossing is None else crossing
     problem = replay_problem() if problem is None else problem
-    settings = Settings(staleness=StalenessPolicy(keep=0)) if settings is None else settings
+    if settings is None:
+        settings = Settings(staleness=StalenessPolicy(keep=0), deadline=None)
     if seed < 0:
         raise BoundsError("seed", f"{seed} is negative")
     people = recorded_people(recording, radius)

@@ -16,6 +16,7 @@ from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.predictors import Predictor, ReportPredictor
 from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
 from scp_mpc.simulation.disturbance import CorrelatedDisturbance, Disturbance
 from scp_mpc.simulation.plant import ModelPlant
 from scp_mpc.simulation.run import Run
@@ -97,12 +98,13 @@ class Scenario(Scene):
         """Run the closed loop of III.F; the same seed gives the same states, bit for bit.
 
         Args:
-            controller: What plans; `MPC(self.problem())` if None.
+            controller: What plans; `MPC` without a deadline if None.
             steps: Number of control steps K.
             seed: Seed of the disturbance.
             advance: Called after each step, for a progress bar.
         """
-        controller = MPC(self.problem()) if controller is None else controller
+        if controller is None:
+            controller = MPC(self.problem(), Settings(deadline=None))
         plant, rng = ModelPlant(controller.problem.model, self.disturbance), self.generator(seed)
         run = simulate(controller, self, plant=plant, steps=steps, seed=rng, advance=advance)
         return replace(run, seed=seed)

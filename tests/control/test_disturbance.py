@@ -185,8 +185,8 @@ def test_spread_reaches_the_obstacles():
             ("none", None),
             ("closed loop", None),
             ("open loop", None),
-            ("none", 0.1 * np.eye(2)),
-            ("open loop", 0.1 * np.eye(2)),
+            ("none", 0.02 * np.eye(2)),
+            ("open loop", 0.02 * np.eye(2)),
         )
     ]
     assert costs[0] < costs[1] < costs[2] < costs[4]

@@ -11,7 +11,6 @@ from any_robot import DT, ROBOTS, complaints, scene, start, world
 from scp_mpc import MPC, SCP, ObstaclePrediction, Problem, Settings
 from scp_mpc.models import KinematicBicycle, Unicycle
 from scp_mpc.scp import Iterate, KKTResiduals, Multipliers, Status
-from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.plan import Result
 from scp_mpc.simulation.crowds import Crowd
@@ -93,25 +92,6 @@ def test_ways_past_are_tried_where_an_obstacle_matters(slack, force, wanted):
     ):
         end = Result(point, 0.0, 0.0, residuals, Status.VIOLATING, 1, known)
         assert SCP(problem, settings)._multi_start.wanted(end, due=False) is expected
-
-
-def test_the_lesser_violation_counts_states():
-    problem = car(Unicycle(DT), x_max=[np.inf, np.inf, np.inf, 1.0])
-    fallback = Fallback(problem, Settings().tolerance)
-
-    def end(speed, slack=0.0):
-        states = np.zeros((4, 4))
-        states[1:, 3] = speed
-        point = Iterate(states, np.zeros((3, 2)), np.zeros(1), np.full((1, 3), slack))
-        none = KKTResiduals(1.0, 1.0, 1.0)
-        return Result(point, 0.0, 0.0, none, Status.VIOLATING, 1)
-
-    fast, slow, unknown = end(5.0), end(2.0), end(np.nan)
-    assert fallback.lesser(fast, slow) is slow
-    assert fallback.lesser(slow, fast) is slow
-    assert fallback.lesser(unknown, fast) is fast
-    assert fallback.lesser(fast, unknown) is fast
-    assert fallback.lesser(end(0.0, 0.5), slow) is slow
 
 
 def test_a_crowds_problem_keeps_the_rest():

@@ -12,7 +12,7 @@ from rebuilt import couplings_of, rebuilt
 
 from benchmarks.audit import audit
 from benchmarks.peers.violation import largest_violation
-from scp_mpc import MPC, SCP, Settings, Status
+from scp_mpc import MPC, SCP, DoubleIntegrator, Problem, Settings, Status, Unicycle
 from scp_mpc.deadline import Clock
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
@@ -35,7 +35,9 @@ paths = pytest.mark.parametrize("solver", ["osqp", "piqp"])
 @pytest.mark.parametrize("changes", [ALL, SPEED, {"du_max": [INF, 0.5]}, {"x_min": -1.0}])
 @pytest.mark.parametrize("elastic", [False, True])
 def test_the_sparse_program_equals_the_dense_rebuild(changes, elastic):
-    this = problem(N, "exact", 0.5, max_obstacles=2, state_slack_weight=70.0, **changes)
+    soft = [True, True, False, True] if elastic else False
+    more = {"max_obstacles": 2, "state_slack_weight": 70.0, "x_soft": soft, "speed_max": 3.0}
+    this = problem(N, "exact", 0.5, **more, **changes)
     solver, rng = SCP(this), np.random.default_rng(1)
     near = [obstacle(N, (0.5, 0.3)), obstacle(N, (-0.4, 0.2), (0.1, 0.0))]
     for seed in range(3):
@@ -63,7 +65,8 @@ def begun(this, x0, x_ref, obstacles=(), u_last=None):
 
 def test_excess_is_slack_where_it_is_paid_for_and_a_violation_where_not():
     """At an upper and a lower bound; its force is its price."""
-    this, ref = problem(N, x_max=[INF, 2.0, INF, 1.5], x_min=[-INF, -2.0, -0.5, -1.5]), np.zeros(4)
+    limits = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -0.5, -1.5]}
+    this, ref = problem(N, x_soft=True, **limits), np.zeros(4)
     x0 = np.array([0.0, 2.4, -0.6, -1.7])
     at = begun(this, x0, ref)
     plain = at.plain(np.zeros((N, 2)))
@@ -89,7 +92,7 @@ def test_excess_is_slack_where_it_is_paid_for_and_a_violation_where_not():
 @pytest.mark.parametrize("changes", [ALL, SPEED, {"du_min": -0.7, "du_max": 0.7}])
 def test_plans_are_those_of_ipopt(changes, seed, there, solver):
     rng = np.random.default_rng(seed)
-    this, ref = problem(N, **changes), straight_reference(N, rng.uniform(1.5, 3.0))
+    this, ref = problem(N, x_soft=True, **changes), straight_reference(N, rng.uniform(1.5, 3.0))
     x0 = np.array([0.0, rng.uniform(0.8, 2.6), rng.uniform(-0.2, 0.2), rng.uniform(-0.5, 0.5)])
     u_last = rng.uniform(-1.0, 1.0, 2)
     one = obstacle(N, (2.5, rng.uniform(-0.4, 0.4)), covariance=0.01 * np.eye(2))
@@ -113,7 +116,7 @@ def test_plans_are_those_of_ipopt(changes, seed, there, solver):
 @paths
 def test_slack_is_what_the_brakes_leave_of_a_start_outside(solver):
     """3 m/s where 2 m/s are allowed: 0.2 m/s less at every stage, and no more."""
-    this = problem(N, u_min=-1.0, **SPEED)
+    this = problem(N, u_min=-1.0, x_soft=True, **SPEED)
     ref = straight_reference(N, 3.0)
     plan = SCP(this, Settings(solver=solver)).solve(ref[0], ref)
     assert plan.status is Status.SOFTENED
@@ -133,12 +136,74 @@ def test_slack_is_what_the_brakes_leave_of_a_start_outside(solver):
 
 
 @paths
+@pytest.mark.parametrize("limit", [SPEED, {"speed_max": 2.0}], ids=["axis", "speed"])
+def test_a_hard_bound_is_what_full_braking_reaches(solver, limit):
+    """From 3 m/s to 2 at 1 m/s^2, and no step longer: not ok as long as it lasts."""
+    this = problem(N, u_min=-1.0, **limit)
+    ref = straight_reference(N, 3.0)
+    plan = SCP(this, Settings(solver=solver)).solve(ref[0], ref)
+    assert plan.status is Status.SOFTENED
+    np.testing.assert_allclose(plan.X[1:, 1], np.maximum(2.0, 3.0 - 0.2 * np.arange(1, N + 1)))
+    assert plan.kkt.worst < 1e-6
+    within = SCP(this, Settings(solver=solver)).solve([0.0, 2.0, 0.0, 0.0], ref)
+    assert within.status is Status.CONVERGED
+
+
+@paths
+@pytest.mark.parametrize("kind", ["point", "unicycle"])
+@pytest.mark.parametrize("seed", range(3))
+def test_obstacles_yield_before_the_speed_does(solver, kind, seed):
+    """Somebody comes too fast to be let pass: no plan is faster than allowed, with slack or not."""
+    rng, faces = np.random.default_rng(seed), np.pi / 16
+    point = kind == "point"
+    this = Problem(
+        DoubleIntegrator(0.2) if point else Unicycle(0.2),
+        horizon=N,
+        Q=[1, 0.1, 1, 0.1] if point else [1, 1, 0.05, 0.1],
+        R=[0.05, 0.05],
+        u_min=-2.0,
+        u_max=2.0,
+        robot_radius=0.3,
+        speed_max=1.0,
+        max_obstacles=2,
+        nodes_per_interval=1,
+    )
+    x = this.model.state(np.zeros(2), np.array([0.9, 0.0]))
+    mpc, softened = MPC(this, Settings(solver=solver)), 0
+    for _ in range(6):
+        ahead = [[1.2, rng.uniform(-0.3, 0.3)], [-1.2, rng.uniform(-0.3, 0.3)]]
+        toward = [obstacle(N, p, (-2.0 * np.sign(p[0]), 0.0)) for p in ahead]
+        plan = mpc.step(x, this.model.state(np.array([4.0, 0.0]), np.zeros(2)), toward)
+        speeds = np.linalg.norm(plan.X[:, this.model.velocity], axis=1)
+        assert speeds.max() <= 1.0 + 1e-6
+        softened += plan.slack.max() > 0.01
+        x = this.model.step(x, plan.u0)
+    assert softened >= 1
+    # All of the speed along an axis, and nearly all of it in between.
+    for angle, least in ((0.0, 1.0), (faces, np.cos(faces)), (0.3, np.cos(faces))):
+        goal = 9.0 * np.array([np.cos(angle), np.sin(angle)])
+        x = this.model.state(np.zeros(2), np.array([np.cos(angle), np.sin(angle)]) * 0.5)
+        plan = SCP(this, Settings(solver=solver)).solve(x, this.model.state(goal, np.zeros(2)))
+        speeds = np.linalg.norm(plan.X[:, this.model.velocity], axis=1)
+        assert least - 1e-6 <= speeds.max() <= 1.0 + 1e-9
+
+
+def test_a_robot_too_fast_for_its_room_leaves_it_no_farther_than_braking_does():
+    this = problem(N, u_min=-1.0, u_max=1.0, x_max=[2.0, INF, INF, INF])
+    x0 = np.array([0.0, 2.5, 0.0, 0.0])
+    plan, brake = SCP(this).solve(x0, np.zeros(4)), SCP(this).brake(x0, np.zeros(4))
+    assert not plan.ok
+    assert plan.X[:, 0].max() <= brake.X[:, 0].max() + 1e-6
+    assert plan.x_slack[:, 0].max() == pytest.approx(max(brake.X[:, 0]) - 2.0, abs=1e-6)
+
+
+@paths
 def test_slack_at_lower_bounds_too_and_only_as_long_as_it_pays(solver):
-    this = problem(N, x_min=[-INF, 0.5, -INF, -INF], u_max=1.0)
+    this = problem(N, x_min=[-INF, 0.5, -INF, -INF], u_max=1.0, x_soft=True)
     still = SCP(this, Settings(solver=solver)).solve(np.zeros(4), np.zeros(4))
     np.testing.assert_allclose(still.x_slack[:, 1], [0.3, 0.1, *[0.0] * 6], atol=1e-7)
     np.testing.assert_allclose(still.multipliers.states[:2, 0], -100.0, rtol=1e-7)
-    cheap = problem(N, x_min=[-INF, 0.5, -INF, -INF], u_max=1.0, state_slack_weight=1e-4)
+    cheap = replace(this, state_slack_weight=1e-4)
     plan = SCP(cheap, Settings(solver=solver)).solve(np.zeros(4), np.zeros(4))
     assert plan.status is Status.SOFTENED
     assert plan.x_slack[:, 1].min() > 0.4
@@ -234,7 +299,7 @@ def test_closed_loops_keep_inputs_and_rates_always(solver, targets, steps, seed)
 
 
 def test_the_merit_includes_the_price_of_the_excess():
-    this, ref = problem(N, u_min=-1.0, **SPEED), straight_reference(N, 3.0)
+    this, ref = problem(N, u_min=-1.0, x_soft=True, **SPEED), straight_reference(N, 3.0)
     solver = SCP(this)
     at, loop = solver._at, solver._loop
     at.begin(Step.read(this, ref[0], ref, [], nodes=at.nodes), Clock())

@@ -49,6 +49,11 @@ SPEED = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -INF, -INF]}
         ({"du_max": NAN}, NotFiniteError, "du_max"),
         ({"du_max": np.ones(4)}, ShapeError, "du_max"),
         ({"state_slack_weight": 0.0}, BoundsError, "state_slack_weight"),
+        ({"x_soft": [True, False]}, InvalidArgumentError, "x_soft"),
+        ({"x_soft": 1.0}, InvalidArgumentError, "x_soft"),
+        ({"speed_max": 0.0}, BoundsError, "speed_max: 0.0"),
+        ({"speed_max": NAN}, NotFiniteError, "speed_max"),
+        ({"speed_max": "fast"}, InvalidArgumentError, "speed_max"),
         ({"state_slack_weight": INF}, NotFiniteError, "state_slack_weight"),
     ],
 )
@@ -83,7 +88,7 @@ def test_bounds_are_copied_and_frozen():
 
 
 def test_the_excess_is_what_is_outside_the_bounds_from_stage_one():
-    this = problem(8, x_max=[INF, 2.0, INF, 1.5], x_min=[-INF, -2.0, -1.0, -INF])
+    this = problem(8, x_max=[INF, 2.0, INF, 1.5], x_min=[-INF, -2.0, -1.0, -INF], x_soft=True)
     states = np.zeros((9, 4))
     states[0] = 99.0
     states[3], states[5] = [50.0, 3.0, -4.0, 1.0], [0.0, -2.5, 0.0, -99.0]
@@ -92,6 +97,8 @@ def test_the_excess_is_what_is_outside_the_bounds_from_stage_one():
     np.testing.assert_array_equal(this.excess(states), expected)
     slack = np.array([[0.25, 0.5]])
     assert this.penalty(slack, states) == pytest.approx(1e3 * 0.75 + 100.0 * 4.5)
+    some = replace(this, x_soft=[False, True, False, False])
+    assert some.penalty(slack, states) == pytest.approx(1e3 * 0.75 + 100.0 * 1.5)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +227,7 @@ def test_the_audit_finds_rates_and_states_beyond_their_bounds():
 
 
 def test_braking_keeps_rates_and_says_what_states_exceed():
-    this = problem(N, du_min=-0.4, du_max=0.4, u_min=-1.0, **SPEED)
+    this = problem(N, du_min=-0.4, du_max=0.4, u_min=-1.0, x_soft=True, **SPEED)
     start, last = np.array([0.0, 3.0, 0.0, 0.0]), np.array([0.5, 0.0])
     plan = SCP(this).brake(start, np.zeros(4), u_last=last)
     assert plan.status is Status.FALLBACK

@@ -233,8 +233,8 @@ def test_pairs_left_out_come_back_when_the_plan_moves_onto_them(monkeypatch):
 def test_the_slacks_own_multipliers_balance_their_price():
     """Where a pair yields: price + force on the pair + multiplier of slack >= 0 is nothing."""
     case = problem(8)
-    x0, ref = np.array([0.0, 4.0, 0.0, 0.0]), straight_reference(8, 4.0)
-    plan = SCP(case).solve(x0, ref, [obstacle(8, (1.2, 0.05), covariance=np.eye(2))])
+    standing = obstacle(8, (1.2, 0.05), covariance=np.eye(2), growth=0.0)
+    plan = SCP(case).solve(np.zeros(4), straight_reference(8, -4.0), [standing])
     assert plan.status is Status.SOFTENED
     balance = case.slack_weight + plan.multipliers.obstacles + plan.multipliers.slack
     np.testing.assert_allclose(balance, 0.0, atol=1e-6)

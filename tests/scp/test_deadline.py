@@ -55,11 +55,45 @@ def test_a_single_hiccup_is_not_the_tasks():
     assert pace.expected("task") == 4.0
 
 
-def test_work_is_believed_at_once():
+def test_work_far_longer_than_ever_is_believed_the_second_time():
     pace = Pace()
     pace.learn("task", 0.3, 0.3)
     pace.learn("task", 5.0, 4.9)
+    assert pace.expected("task") == pytest.approx(0.9)
+    pace.learn("task", 5.0, 4.9)
     assert pace.expected("task") == 5.0
+
+
+def test_what_is_too_long_for_any_step_is_tried_again_and_believed():
+    """A few refusals after one pause; a task that is short again is short from then on."""
+    pace = Pace()
+    pace.learn("task", 0.06)
+    clock = Clock(0.01, pace)
+    tries = 0
+    while not clock.allows("task"):
+        tries += 1
+    assert tries <= 4
+    pace.learn("task", 0.002)
+    assert pace.expected("task") == pytest.approx(0.002)
+
+
+def test_a_budget_of_programs_ends_the_search_without_a_deadline():
+    clock = Clock(None, Pace(), programs=3)
+    assert clock.room("candidate", 9) == 3
+    assert [clock.allows(task) for task in ("iteration", "backup", "candidate", "iteration")]
+    assert not clock.allows("iteration")
+    assert not clock.allows("candidate")
+    assert clock.allows("backup")
+    assert clock.room("candidate", 9) == 0
+
+
+def test_a_timer_that_is_handed_in_is_the_clock(time):
+    now = [7.0]
+    clock = Clock(1.0, Pace(), timer=lambda: now[0])
+    time[0] = 100.0
+    assert clock.elapsed() == 0.0
+    now[0] += 0.5
+    assert clock.elapsed() == 0.5
 
 
 @pytest.mark.usefixtures("time")

@@ -103,7 +103,7 @@ def shifted(obstacles):
 def test_too_fast_to_brake_is_no_safe_plan():
     x0, ref, ahead = closing(4.0)
     plan = SCP(problem(N), Settings(deadline=1e-9)).solve(x0, ref, ahead)
-    assert plan.status is Status.FALLBACK
+    assert plan.status in (Status.STOPPING, Status.FALLBACK)
     assert not plan.ok
     assert plan.slack.max() > 0.1
     np.testing.assert_allclose(plan.u0, [-3.0, 0.0])
@@ -123,15 +123,18 @@ def test_a_safe_plan_that_is_known_beats_slack():
 def test_predictions_of_time_are_long_times_slowly_forgotten():
     pace = Pace()
     assert pace.expected("program") == 0
-    pace.learn("program", 2.0)
+    for _ in range(50):
+        pace.learn("program", 2.0)
     pace.learn("program", 1.0)
     assert 1.9 < pace.expected("program") < 2.0
     clock = Clock(1.0, pace)
-    assert not clock.allows("program")
-    tries = 1
-    while not clock.allows("program"):  # what was never begun must not be shut out for ever
-        tries += 1
-    assert 10 < tries < 60
+    tries = []
+    for _ in range(4):
+        tries.append(1)
+        while not clock.allows("program"):  # what was never begun must not be shut out for ever
+            tries[-1] += 1
+        pace.learn("program", 2.0)  # nothing has changed: less and less often
+    assert tries == [4, 7, 13, 25]
     assert Clock(None, pace).allows("program")
 
 
@@ -170,6 +173,7 @@ def test_a_slow_solver_stops_the_search_and_is_counted(monkeypatch):
     assert 1 <= len(begun) <= 2
     assert mpc.overruns == quick + 1
     assert late.candidates == ()
+    mpc.step(*step)  # once may be an accident
     begun.clear()
     known = mpc.step(*step)  # now it is known that programs take too long
     assert not begun

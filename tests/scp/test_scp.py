@@ -154,10 +154,10 @@ def test_more_tolerance_takes_fewer_programs():
 
 
 def blocked():
-    """A robot that cannot avoid the obstacle in time."""
+    """A robot within an obstacle's no-go set, that leaves it."""
     case = problem(8)
-    x0 = np.array([0.0, 4.0, 0.0, 0.0])
-    return case, x0, straight_reference(8, 4.0), [obstacle(8, (1.2, 0.05), covariance=np.eye(2))]
+    standing = [obstacle(8, (1.2, 0.05), covariance=np.eye(2), growth=0.0)]
+    return case, np.zeros(4), straight_reference(8, -4.0), standing
 
 
 def test_what_cannot_be_avoided_is_softened_and_said_so():
@@ -198,7 +198,7 @@ def test_without_any_solution_the_robot_brakes_within_limits():
     x0 = case.x0 + [0.0, 3.0, 0.0, 0.0]
     guess = Trajectory(case.x_ref, np.tile([7.0, 0.0], (8, 1)))
     plan = SCP(case.problem, DEAD).solve(x0, case.x_ref, case.obstacles, guess)
-    assert plan.status is Status.FALLBACK
+    assert plan.status is Status.STOPPING
     assert not plan.ok
     # Straight ahead, at the limit of the first axis; the second one's share keeps the direction.
     np.testing.assert_allclose(plan.u0, -3.0 * x0[[1, 3]] / x0[1])

@@ -57,7 +57,7 @@ CASES = {
     "plane": linear,
     "space": lambda **changes: linear(3, **changes),
     "axes": lambda **changes: linear(inflation="axes", **changes),
-    "bounds": lambda **changes: linear(**BOUNDED, **changes),
+    "bounds": lambda **changes: linear(**BOUNDED, x_soft=True, **changes),
     "fixed size": lambda **changes: linear(margin=Margin.fixed(2.0), **changes),
     "discs": lambda **changes: nonlinear("unicycle", discs=[-0.2, 0.1, 0.4], **changes),
     "free size": lambda **changes: nonlinear("bicycle", margin=Margin(2.0, 0.5, 3.0), **changes),
@@ -224,8 +224,9 @@ def test_at_convergence_others_solve_it_with_the_plan(name, kind, solver):
 
 
 def test_at_convergence_an_elastic_one_is_solved_with_the_same_slack():
-    this, ref = problem(8), straight_reference(8, 4.0)
-    blocking = [obstacle(8, (1.2, 0.05), covariance=np.eye(2))]
+    this, ref = problem(8), straight_reference(8, -4.0)
+    ref[0] = 0.0
+    blocking = [obstacle(8, (1.2, 0.05), covariance=np.eye(2), growth=0.0)]
     scp = SCP(this, Settings(tolerance=1e-9))
     plan = scp.solve(ref[0], ref, blocking)
     assert plan.status is Status.SOFTENED

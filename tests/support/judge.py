@@ -18,7 +18,7 @@ from scipy import stats
 TOLERANCE = 1e-6  # of a constraint [m] and of the dynamics, the settings' default
 _ROUNDING = float(np.finfo(np.float64).eps)
 _OK = ("CONVERGED", "FEASIBLE", "PREVIOUS", "BRAKING")
-_NOT_OK = ("SOFTENED", "VIOLATING", "FALLBACK", "STALE")
+_NOT_OK = ("SOFTENED", "STOPPING", "VIOLATING", "FALLBACK", "STALE")
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scp_mpc import SCP
 from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 from scp_mpc.trajectory import rollout
 
-SLOTS = 3  # for half-spaces at each node
+SLOTS, ELASTIC_SLOTS = 3, 10  # for half-spaces at each node
 _H = 1e-5
 
 
@@ -102,7 +103,9 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
         couplings: Coefficients of below and above (N nb,), and of slack, which are free to choose.
     """
     model, N, size = problem.model, problem.horizon, problem.size
-    nx, nu, M, nb = model.nx, model.nu, problem.max_obstacles, len(problem.bounded_states)
+    nx, nu, M = model.nx, model.nu, problem.max_obstacles
+    faces = state_rows(problem)
+    soft = [b for b, (_, _, _, yields) in enumerate(faces) if yields]
     moving = M if size.lower < size.reference else 0
     states = rollout(model.step, x0, inputs).states
     step = Step.read(problem, x0, x_ref, obstacles, u_last=u_last)
@@ -111,8 +114,8 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
         motion = collision.motion(states, inputs)
         step = step.widened(collision.radii(step.radii, step.drift, motion))
     where = nodes(problem, states, inputs)
-    slots = min(M, SLOTS)
-    spare = N * nb if elastic else 0
+    slots = min(M, ELASTIC_SLOTS if elastic else SLOTS)
+    spare = N * len(soft) if elastic else 0
     at_u, at_s = N * nx, N * (nx + nu)
     at_below = at_s + moving
     at_above, at_slack = at_below + spare, at_below + 2 * spare
@@ -159,12 +162,13 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
                     least, most = problem.du_min[a], problem.du_max[a]
                 row(least, most, *entries)
     for i in range(N):
-        for b, a in enumerate(problem.bounded_states):
-            entries, k = [(i * nx + a, [1.0])], i * nb + b
-            if elastic:
+        for b, (face, least, most, _) in enumerate(faces):
+            entries = [(i * nx, face)]
+            if elastic and b in soft:
+                k = i * len(soft) + soft.index(b)
                 entries += [(at_below + k, [couplings[0][k]]), (at_above + k, [-couplings[0][k]])]
-            ref = x_ref[i + 1, a]
-            row(problem.x_min[a] - ref, problem.x_max[a] - ref, *entries)
+            least, most = widened(problem, x0, u_last, i, face, least, most, b in soft, elastic)
+            row(least - face @ x_ref[i + 1], most - face @ x_ref[i + 1], *entries)
     for c, (p, i, by_x, by_u, by_next) in enumerate(where):
         planes = []
         for j in range(len(obstacles)):
@@ -206,6 +210,30 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
     )
 
 
+def state_rows(problem):
+    """Rows of the bounded states and faces of the speed's polygon: (row, lower, upper, soft)."""
+    nx = problem.model.nx
+    bounds = zip(np.eye(nx), problem.x_min, problem.x_max, problem.x_soft, strict=True)
+    rows = [row for row in bounds if np.isfinite(row[1:3]).any()]
+    if problem.speed_max is not None:
+        one, other = problem.model.velocity
+        for k in range(8):
+            face, angle = np.zeros(nx), (2 * k + 1) * np.pi / 16
+            face[[one, other]] = np.cos(angle), np.sin(angle)
+            rows.append((face / np.cos(np.pi / 16), *np.array([-1, 1]) * problem.speed_max, False))
+    return rows
+
+
+def widened(problem, x0, u_last, i, face, least, most, soft, elastic):
+    """Bounds of a row at stage i + 1, as far as full braking goes where that is beyond."""
+    states = SCP(problem).brake(x0, x0, u_last=u_last).X
+    if not soft and (elastic or face @ x0 > most + 1e-9):
+        most = max(most, face @ states[i + 1])
+    if not soft and (elastic or face @ x0 < least - 1e-9):
+        least = min(least, face @ states[i + 1])
+    return least, most
+
+
 def reach(problem, a, u_last):
     """What rates allow of the first input's entry a."""
     if u_last is None:
@@ -218,6 +246,7 @@ def couplings_of(program, problem):
     """The coefficients with which slack enters its rows, read off an elastic program's prices."""
     N, model, size = problem.horizon, problem.model, problem.size
     moving = problem.max_obstacles if size.lower < size.reference else 0
-    begin, spare = N * (model.nx + model.nu) + moving, N * len(problem.bounded_states)
+    begin = N * (model.nx + model.nu) + moving
+    spare = N * sum(soft for *_, soft in state_rows(problem))
     states = program.q[begin : begin + spare] / problem.state_slack_weight
     return states, float(program.q[-1]) / problem.slack_weight
