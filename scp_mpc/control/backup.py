@@ -58,6 +58,9 @@ class Backup:
             table.append((speed, length, len(stop) * problem.model.dt))
         self._speeds, *self._braking = np.array(table).T  # way [m] and time [s] over speeds [m/s]
         self._body = problem.robot_radius + float(np.abs(problem.discs).max())
+        at = problem.model.position
+        self._room = problem.x_min[at], problem.x_max[at]
+        self.walled = bool(np.isfinite(self._room).any())
 
     def of(
         self, states: FloatArray, inputs: FloatArray, obstacles: Sequence[ObstaclePrediction]
@@ -82,12 +85,17 @@ class Backup:
         return braking(self._problem, x)
 
     def _is_far(self, end: FloatArray, obstacles: Sequence[ObstaclePrediction]) -> bool:
-        """Whether no obstacle can be met while braking, from the last two positions (2, d)."""
-        dt, N = self._problem.model.dt, obstacles[0].horizon
+        """Whether nothing can be met while braking, from the last two positions (2, d)."""
+        dt = self._problem.model.dt
         speed = float(np.linalg.norm(end[1] - end[0])) / dt
         if speed > self._speeds[-1]:
             return False
         way, time = (_RESERVE * np.interp(speed, self._speeds, part) for part in self._braking)
+        if min((end[1] - self._room[0]).min(), (self._room[1] - end[1]).min()) < way:
+            return False
+        if not obstacles:
+            return True
+        N = obstacles[0].horizon
         last = np.array([o.means[N - 1 :] for o in obstacles])
         drift = np.linalg.norm(last[:, 1] - last[:, 0], axis=1) / dt
         variance = np.array([o.largest_std[N] ** 2 for o in obstacles])
@@ -104,13 +112,17 @@ class Backup:
         obstacles: Sequence[ObstaclePrediction],
         stage: int,
     ) -> bool:
-        """Whether states (k+1, nx) of inputs (k, nu) from a stage on keep out of all obstacles."""
-        k = len(inputs)
-        if k == 0 or not obstacles:
+        """Whether states (k+1, nx) of inputs (k, nu) from a stage on keep out of all obstacles.
+
+        And within their bounds.
+        """
+        k, path = len(inputs), states[:, self._problem.model.position]
+        if k == 0:
             return True
-        path = states[:, self._problem.model.position]
-        if not self._rests(path, k):
+        if not self._rests(path, k) or self._problem.excess(states).max() > self._tolerance:
             return False
+        if not obstacles:
+            return True
         near = self._near(path, obstacles, stage)
         if not len(near):
             return True

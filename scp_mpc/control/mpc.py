@@ -135,7 +135,8 @@ class MPC:
                 last = as_array("u_last", u_last, (self.problem.model.nu,))
             plan = self._plan(x0, x_ref, recall, robot_covariance, clock, last)
             backup = None
-            if recall.stale is None and recall.obstacles and clock.allows("backup"):
+            ahead = bool(recall.obstacles) or self._backups.walled
+            if recall.stale is None and ahead and clock.allows("backup"):
                 with clock.task("backup"):
                     given = x0, x_ref, recall.obstacles, robot_covariance, last
                     plan, backup = self._backed(plan, *given)

@@ -25,7 +25,7 @@ class Status(Enum):
     BRAKING = "Nothing better in time: the robot brakes and meets every constraint while it does."
     SOFTENED = "No plan that meets every constraint was found; this one violates them by its slack."
     STOPPING = "No plan that meets every constraint: this one violates some as slowly as braking."
-    VIOLATING = "The search ended while the plan still violates a constraint."
+    VIOLATING = "The search ended while the plan still violates a constraint; not handed out."
     FALLBACK = "No plan is known that meets every constraint, nor one better than braking: brake."
     STALE = "The predictions are too old to plan with: brake, whatever is in the way."
 

@@ -272,7 +272,7 @@ class SCP:
             if isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
             ending = clock.mark()
-            best = self._rescued(step, last, found.best)
+            best = self._rescued(step, last, found.best, tired)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
                 best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))
             found = replace(found, best=best)
@@ -280,9 +280,9 @@ class SCP:
                 break
             start, about = found.best.iterate, None
         else:
-            known = self._fallback.best(step, last, tired)
-            best = known if known.status.ok else self._exposed(step, found.best)
-            found = replace(found, best=best)
+            found = replace(
+                found, best=self._known(step, last, self._exposed(step, found.best), tired)
+            )
         plan = self._plan(at.step, found, clock)
         clock.learn("ending", ending)
         return plan
@@ -318,17 +318,24 @@ class SCP:
             plan = start if found is None or found.nominal is None else found.nominal
         return plan
 
-    def _rescued(self, step: Step, last: Iterate | None, best: Result) -> Result:
+    def _known(self, step: Step, last: Iterate | None, best: Result, tired: bool) -> Result:
+        """The last plan or braking, if it holds every constraint; else what is passively safe."""
+        known = self._fallback.best(step, last, tired)
+        if known.status.ok:
+            return known
+        kept = None if last is None else self._fallback.keep(step, last.inputs)
+        return self._fallback.stopping(step, best if best.nominal is not None else None, kept)
+
+    def _rescued(self, step: Step, last: Iterate | None, best: Result, tired: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.
 
         What is known is judged by its own motion between the nodes, and so is what it leads to.
         """
         if best.status.ok:
             return best
-        known = self._fallback.best(step, last)
+        known = self._known(step, last, best, tired)
         if not known.status.ok:
-            kept = None if last is None else self._fallback.keep(step, last.inputs)
-            return self._fallback.stopping(step, best, kept)
+            return known
         own = self._motion(known.iterate)
         self._at.step = self._widened(step, own) if self._between else step
         better = self._loop.run(self._at.at(known.iterate))

@@ -15,9 +15,12 @@ from scp_mpc import (
     DoubleIntegrator,
     LinearModel,
     ObstaclePrediction,
+    Polytope,
+    Problem,
     Settings,
     Status,
     Trajectory,
+    Unicycle,
 )
 from scp_mpc.deadline import Clock, Pace
 from scp_mpc.qp.backend import ProgramSolver
@@ -257,3 +260,65 @@ def test_three_dimensions_brake_too():
     space = {"model": DoubleIntegrator(DT, 3), "Q": [1.0, 0.1] * 3, "R": [0.1] * 3}
     plan = SCP(problem(10, **space)).brake(np.array([0, 1.0, 0, -2.0, 0, 0.5]), np.zeros(6))
     assert np.abs(plan.X[-1, 1::2]).max() < 1e-9
+
+
+def walker(gap, speed, N, dt=0.2):
+    """Somebody ahead who comes closer, known for certain."""
+    means = np.stack([gap - speed * dt * np.arange(N + 1), np.zeros(N + 1)], axis=1)
+    return ObstaclePrediction(means, np.zeros((2, 2)), 0.2)
+
+
+@pytest.mark.parametrize("nodes", [1, 4])
+def test_plans_that_are_not_ok_are_passively_safe(nodes):
+    """Nowhere faster than braking where they violate anything, whatever comes from where."""
+    assert sum(passive(seed, nodes) for seed in range(12)) >= 12
+
+
+def passive(seed, nodes):
+    """How many of five steps are not ok."""
+    rng = np.random.default_rng(seed)
+    point = seed % 2 == 0
+    this = Problem(
+        DoubleIntegrator(0.2) if point else Unicycle(0.2), horizon=12, max_obstacles=3,
+        Q=[1, 0.1, 1, 0.1] if point else [1, 1, 0.05, 0.1], R=[0.05, 0.05], u_min=-2.0, u_max=2.0,
+        robot_radius=0.3, nodes_per_interval=nodes,
+    )  # fmt: skip
+    mpc, x, bad = MPC(this), this.model.state(np.zeros(2), rng.uniform(-1.5, 1.5, 2)), 0
+    for _ in range(5):
+        people = []
+        for _ in range(3):
+            at, way = rng.uniform(-2.5, 2.5, 2), rng.uniform(-2, 2, 2)
+            means = at + 0.2 * np.arange(13)[:, None] * (way + np.sign(way) * 0.4)
+            people.append(ObstaclePrediction(means, 0.01 * np.eye(2), 0.3))
+        plan = mpc.step(x, this.model.state(np.array([4.0, 0.0]), np.zeros(2)), people)
+        if not plan.ok and not plan.status.ok:
+            bad += 1
+            ways = np.linalg.norm(np.diff(plan.X[:, this.model.position], axis=0), axis=1)
+            brake = SCP(this).brake(x, x).X[:, this.model.position]
+            slow = np.linalg.norm(np.diff(brake, axis=0), axis=1) + 0.05 * 0.2 + 1e-9
+            assert (ways <= slow)[plan.slack.max(axis=0) > 1e-6].all()
+        x = this.model.step(x, plan.u0)
+    return bad
+
+
+def test_whoever_comes_too_close_finds_the_robot_at_rest():
+    """In a corridor that is too narrow for two: it stops well before they meet, and stays."""
+    this = problem(20, max_obstacles=3, nodes_per_interval=4)
+    sides = [
+        ObstaclePrediction.static(20, [0, y], 0, shape=Polytope.box([40, 1])) for y in (0.8, -0.8)
+    ]
+    mpc, x, gap, speeds = MPC(this), np.array([0.0, 1.5, 0.0, 0.0]), 6.0, []
+    while gap - x[0] > 0.36:
+        plan = mpc.step(x, straight_reference(20, 1.5), [*sides, walker(gap, 3.2, 20)])
+        x, gap = this.model.step(x, plan.u0), gap - 0.64
+        speeds.append(x[1])
+    assert speeds[-1] <= 0.05
+    assert speeds[0] > 0.5
+
+
+def test_no_status_says_that_braking_is_in_time_when_it_is_not():
+    this, fast = problem(N, nodes_per_interval=4), np.array([0.0, 3.0, 0.0, 0.0])
+    wall = [ObstaclePrediction.static(N, [1.0, 0.0], 0.0, shape=Polytope.box([0.2, 20.0]))]
+    plan = SCP(this).solve(fast, straight_reference(N, 3.0), wall)
+    assert plan.status is Status.FALLBACK
+    np.testing.assert_allclose(plan.u0, [-3.0, 0.0])
