@@ -1,0 +1,125 @@
+"""The benchmark of safety: its worlds, its judge and its search, against what is known by hand."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.safety import broken, episode, judged, main, summarise
+from benchmarks.safety_search import is_reachable
+from benchmarks.safety_worlds import ROBOTS, SHARES, Drive, Thing, World, drive
+from scp_mpc import MPC, Settings, Status
+
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+STILL = np.zeros(2)
+
+
+class Blind:
+    """Sees nothing, and drives straight on."""
+
+    def __init__(self, problem):
+        self._mpc = MPC(problem, Settings(deadline=None))
+
+    def step(self, x0, x_ref, _obstacles):
+        return self._mpc.step(x0, x_ref, [])
+
+
+def box(x, y, half, velocity=(0.0, 0.0)):
+    return Thing(np.array([x, y]), np.array(velocity), SQUARE * half, 0.0, np.zeros(31))
+
+
+def world(things, robot="double integrator"):
+    """One with these things in it, 5 m to go at 2 m/s."""
+    found = next(w for w in map(World, range(99)) if w.robot == robot and w.dt == 0.2)
+    found.things, found.radius, found.goal, found.speed_max = things, 0.3, np.array([5.0, 0]), None
+    return found
+
+
+def test_a_seed_is_a_world():
+    told = [World(5, moving=True).predictions(0.3) for _ in range(2)]
+    for one, other in zip(*told, strict=True):
+        np.testing.assert_array_equal(one.means, other.means)
+        np.testing.assert_array_equal(one.covariances, other.covariances)
+    assert {World(seed).robot for seed in range(20)} == set(ROBOTS)
+    assert not any(thing.velocity.any() for thing in World(5).things)
+    worlds = [World(seed, moving=True) for seed in range(20)]
+    moving = [thing.velocity.any() for w in worlds for thing in w.things]
+    assert 0.5 < np.mean(moving) < 0.9
+
+
+def test_gaps_by_hand():
+    square = box(2.0, 0.0, [1.0, 0.5], velocity=[0.0, 1.0])
+    points = np.array([[0.0, 0.0], [2.0, 0.1], [4.0, 1.5], [2.0, 0.0]])
+    times = np.array([0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(square.gaps(points, times), [1.0, -0.4, np.sqrt(2), 0.5])
+    disc = Thing(np.array([3.0, 4.0]), STILL, np.zeros((1, 2)), 1.0, np.zeros(9))
+    np.testing.assert_allclose(disc.gaps(np.array([[0.0, 0.0], [3.0, 4.0]]), 7.0), [4.0, -1.0])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_judges_way_is_the_models(robot):
+    rng, judge = np.random.default_rng(0), world([], robot)
+    model = judge.problem.model
+    states, inputs = rng.uniform(-0.6, 0.6, (30, model.nx)), rng.uniform(-2, 2, (30, 2))
+    wanted = model.advance(states, inputs[None], SHARES[:, None])[..., model.position]
+    atol = 1e-6 if robot == "bicycle" else 1e-12  # whose model is a Runge-Kutta method
+    np.testing.assert_allclose(judge.path(states, inputs), wanted.swapaxes(0, 1), atol=atol)
+
+
+def test_a_contact_between_two_samples_is_found():
+    """0.4 m per interval, past something that is touched halfway."""
+    peg = Thing(np.array([0.6, 0.33]), STILL, np.zeros((1, 2)), 0.04, np.zeros(31))
+    states = np.array([[0.4 * k, 2.0, 0, 0] for k in range(4)])
+    plan = SimpleNamespace(
+        u0=np.zeros(2), ok=True, status=Status.CONVERGED, slack=np.zeros(1), x_slack=np.zeros(1)
+    )
+    run = Drive(world([peg]), states, [plan] * 3, np.zeros(3), arrived=False)
+    assert (run.gaps()[:, [0, -1]] > 0.02).all()
+    row = judged(run)
+    assert row["gap"] == pytest.approx(-0.01)
+    assert row["contact"]["step"] == 1
+    assert row["contact"]["speed"] == pytest.approx(2.0)
+    total = summarise([row | {"reachable": True, "seconds": 1.0}])
+    assert (total["contacts_moving"], total["contacts_at_rest"]) == (1, 0)
+    assert len(broken([row | {"reachable": False}])) == 1
+
+
+def wall(opening):
+    """Across the whole room, with a door of half an opening [m] in the way."""
+    return [box(2.5, side * (opening + 6.0), [0.1, 6.0]) for side in (-1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("things", "reachable"),
+    [
+        ([], True),
+        (wall(0.0), False),
+        (wall(0.35), False),  # 0.05 m to spare
+        (wall(0.45), True),
+        ([*wall(0.45), box(2.9, -7.0, [0.1, 6.0], [0.0, 1.0])], False),  # passes by for 12 s
+        ([*wall(0.45), box(2.9, -2.0, [0.1, 1.0], [0.0, 1.0])], True),  # for 2 s
+    ],
+    ids=["free", "closed", "narrow", "door", "closed for ever", "closed for a while"],
+)
+def test_the_search_finds_doors(things, reachable):
+    assert is_reachable(world(things)) == reachable
+
+
+def test_a_blind_controller_is_caught():
+    worlds = [World(seed) for seed in range(4)]
+    rows = [judged(drive(w, Blind(w.problem))) for w in worlds]
+    assert any(row["contact"] and row["contact"]["speed"] > 0.5 for row in rows)
+    assert not any(row["not_ok"] for row in rows)
+
+
+def test_a_run_goes_on_where_it_ended(tmp_path):
+    main("standing", tmp_path, episodes=1)
+    shown = []
+    main("standing", tmp_path, episodes=2, echo=shown.append)
+    assert "| episodes, control steps | 2, " in shown[0]
+    lines = (tmp_path / "safety-standing.jsonl").read_text().split("\n")[1:]
+    assert [json.loads(line)["seed"] for line in lines] == [0, 1]
+    row = json.loads(lines[1])["row"]
+    del row["milliseconds"], row["seconds"]
+    assert row.items() <= episode(1, moving=False).items()
