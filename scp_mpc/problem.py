@@ -49,7 +49,14 @@ from scp_mpc.arrays import (
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation, Inflation
-from scp_mpc.geometry.margin import Containment, Margin, MarginSpec, size_at
+from scp_mpc.geometry.margin import (
+    Containment,
+    JointRisk,
+    Margin,
+    MarginSpec,
+    StageRisk,
+    size_at,
+)
 from scp_mpc.models.model import Model
 from scp_mpc.models.riccati import terminal_weight
 from scp_mpc.settings import require_positive
@@ -77,6 +84,11 @@ class Problem:
             `StageRisk`, `JointRisk` or `Containment`. None: 95 % containment, in the plane as the
             report's `Margin`.
         inflation: "exact" for ellipsoid (+) ball, "axes" for the report's lengthened axes.
+        growth_time: Seconds ahead up to which the covariances of obstacles grow for the plan; None
+            for the whole horizon. What is farther ahead is planned again, with later measurements,
+            before it is executed: with this the robot does not wander about ellipses that will
+            have shrunk by then. It should be no shorter than what braking takes. Not for promises
+            of a risk, which are about all of the plan.
         max_obstacles: Number of obstacle slots M in the program.
         nodes_per_interval: K, collision nodes in each interval, the sample included. Above 1 the
             radii grow, interval by interval, so that nothing passes between two nodes. 1: the
@@ -113,6 +125,7 @@ class Problem:
     robot_radius: float
     margin: MarginSpec
     inflation: Literal["exact", "axes"]
+    growth_time: float | None
     max_obstacles: int
     nodes_per_interval: int
     slack_weight: float
@@ -138,6 +151,7 @@ class Problem:
         robot_radius: float = 0.0,
         margin: MarginSpec | None = None,
         inflation: Literal["exact", "axes"] = "exact",
+        growth_time: float | None = None,
         max_obstacles: int = 1,
         nodes_per_interval: int = 4,
         slack_weight: float = 1e3,
@@ -176,6 +190,12 @@ class Problem:
             margin = Margin() if model.dim == 2 else Containment(0.95)
         if not isinstance(margin, MarginSpec):
             raise InvalidArgumentError("margin", f"{margin!r} is no Margin, risk or Containment")
+        if growth_time is not None:
+            require_positive("growth_time", growth_time)
+            if isinstance(margin, StageRisk | JointRisk):
+                raise InvalidArgumentError(
+                    "growth_time", f"{growth_time} s would break the promise of {margin}"
+                )
         weights = as_weight("Q", Q, model.nx), as_weight("R", R, model.nu)
         if isinstance(Qf, str) and Qf == "lqr":
             Qf = terminal_weight(model, *weights)
@@ -190,6 +210,7 @@ class Problem:
             "robot_radius": radius,
             "margin": margin,
             "inflation": inflation,
+            "growth_time": None if growth_time is None else float(growth_time),
             "max_obstacles": max_obstacles,
             "nodes_per_interval": nodes_per_interval,
             "slack_weight": float(slack_weight),

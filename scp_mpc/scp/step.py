@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import BoolArray, FloatArray, as_array, require_positive_semidefinite
+from scp_mpc.arrays import BoolArray, FloatArray, IntArray, as_array, require_positive_semidefinite
 from scp_mpc.errors import ShapeError, TooManyObstaclesError
 from scp_mpc.geometry.margin import Margin
 from scp_mpc.geometry.no_go import NoGoSets
@@ -27,6 +27,7 @@ from scp_mpc.scp.nodes import Nodes
 
 Braked = Literal["none", "outside", "all"]
 
+_TICK = 1e-9
 _TOUCH = 1e-9  # [m] within another body that is not
 _OUTSIDE = 1e-9  # of a bound, in its own unit, that is not
 _SIGMAS = 3.0  # standard deviations that an obstacle's way may differ from its mean's by
@@ -116,7 +117,12 @@ class Step:
     @cached_property
     def covariances(self) -> FloatArray:
         """(J, C+1, d, d) covariances that the sizes s apply to [m^2]."""
+        return self._covariances(self._grown)
+
+    def _covariances(self, row: IntArray | None) -> FloatArray:
         covariances = np.array([o.covariances for o in self.obstacles])
+        if row is not None:
+            covariances = covariances[np.arange(self.count)[:, None], row]
         if self.robot_covariance is not None:
             covariances = covariances + self.robot_covariance
         covariances = self.nodes.interpolated(covariances)
@@ -128,7 +134,7 @@ class Step:
     @cached_property
     def largest_stds(self) -> FloatArray:
         """(J, C+1) bounds of the standard deviations in any direction [m]."""
-        largest_stds = np.array([o.largest_std for o in self.obstacles])
+        largest_stds = self._plain_stds
         if self.robot_covariance is None and self.nodes.count == 1 and self.scale is None:
             return largest_stds
         variances = largest_stds * largest_stds
@@ -140,6 +146,25 @@ class Step:
         return largest_stds
 
     @cached_property
+    def _grown(self) -> IntArray | None:
+        """(J, N+1) the row of each prediction that counts at each stage; None for its own."""
+        if self.problem.growth_time is None or not self.obstacles:
+            return None
+        last = int(np.ceil(self.problem.growth_time / self.problem.model.dt - _TICK))
+        stds = np.array([o.largest_std for o in self.obstacles])
+        stage = np.arange(stds.shape[1])
+        last = min(last, len(stage) - 1)
+        return np.where((stage > last) & (stds > stds[:, last, None]), last, stage)
+
+    @cached_property
+    def _plain_stds(self) -> FloatArray:
+        """(J, N+1) largest standard deviations of the predictions [m]."""
+        stds = np.array([o.largest_std for o in self.obstacles])
+        if self._grown is None:
+            return stds
+        return np.take_along_axis(stds, self._grown, axis=1)
+
+    @cached_property
     def drift(self) -> FloatArray:
         """Way of the obstacles between two instants (J, C) [m].
 
@@ -147,7 +172,7 @@ class Step:
         """
         nodes, now = self.nodes, self.means[:, :1]
         means = np.concatenate([now, self.means[:, nodes.discs :: nodes.discs]], axis=1)
-        variances = np.array([o.largest_std for o in self.obstacles]) ** 2
+        variances = self._plain_stds**2
         growth = np.sqrt(np.maximum(variances[:, 1:] - variances[:, :-1], 0.0))
         growth = np.repeat(growth / nodes.instants, nodes.instants, axis=1)
         length: FloatArray = np.sqrt(_squared(means[:, 1:] - means[:, :-1]))
@@ -330,7 +355,8 @@ class Step:
         if not self.count:
             return np.zeros((0, self.nodes.size))
         plain = self if self.scale is None else replace(self, scale=None)
-        given = plain.means[:, 1:], plain.covariances[:, 1:], self.radii, self.count, self.shapes
+        Sigma = plain._covariances(None)[:, 1:]  # a risk is that of the whole prediction
+        given = plain.means[:, 1:], Sigma, self.radii, self.count, self.shapes
         return risk_bound(NoGoSets.stacked(*given), path)
 
 
