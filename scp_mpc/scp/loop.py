@@ -25,7 +25,12 @@ from scp_mpc.scp.candidates import PassingPattern, same_pattern
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.history import Record, recorded
 from scp_mpc.scp.iterate import NEGLIGIBLE
-from scp_mpc.scp.newton import negative_curvature_step, refined, second_order_correction
+from scp_mpc.scp.newton import (
+    negative_curvature_step,
+    refined,
+    restored,
+    second_order_correction,
+)
 from scp_mpc.scp.plan import Result, judge
 from scp_mpc.scp.transcription import Relaxation, Transcription
 from scp_mpc.scp.trust_region import TrustRegion
@@ -34,6 +39,7 @@ _SURPLUS = 0.1  # of the tolerance: worth one more iteration, whose convergence 
 _LEAST_COST = 1e-3  # relative to which products of forces and gaps are judged
 _PATIENCE = 3  # iterations before a run towards a goal is given up
 _FAR = 1.1  # share of the goal's merit above which it is
+_NEARLY = 0.01  # [m], or unit of a state: a violation that steps onto the constraints may mend
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
 
 
@@ -109,7 +115,20 @@ class Loop:
                 continue
             if goal is not None and self._is_dominated(iterations, trial, goal):
                 return None
-        return None if reached is None else self.result(reached, level, iterations, tuple(history))
+        if reached is None:
+            return None
+        if self._is_nearly_feasible(reached):  # out of iterations: a plan that can be followed
+            near = restored(at, reached, self._settings.tolerance)
+            reached, level = (near, Relaxation.NONE) if near is not None else (reached, level)
+        return self.result(reached, level, iterations, tuple(history))
+
+    def _is_nearly_feasible(self, plan: Nominal) -> bool:
+        """Whether a nonlinear robot's plan violates its constraints, but hardly."""
+        if self._at.linear or plan.residuals.worst <= self._settings.tolerance:
+            return False
+        deep = max(plan.residuals.feasibility, float(plan.slack.max(initial=0.0)))
+        deep = max(deep, float(plan.excess.max(initial=0.0)))
+        return self._settings.tolerance < deep <= _NEARLY
 
     def result(
         self,

@@ -30,12 +30,13 @@ import numpy as np
 from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.qp.active_set import QPSolution, holds
+from scp_mpc.qp.active_set import QPSolution, holds, settled
 from scp_mpc.scp.certificate import CURVATURE_TOLERANCE, Nominal
 from scp_mpc.scp.transcription import Program, Transcription
 
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
 _LESS = 1e-9  # relative fall of the merit that is none
+_RESTORATIONS, _MOST = 3, 100  # steps, and changes of the active set in each
 
 
 def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolution:
@@ -70,6 +71,32 @@ def second_order_correction(program: Program, solution: QPSolution, trial: Nomin
     wanted[pairs] = -g[at][solution.indices[pairs] - nf]
     change, *_ = np.linalg.lstsq(rows, wanted)
     return replace(solution, v=solution.v + change)
+
+
+def restored(at: Transcription, plan: Nominal, tolerance: float) -> Nominal | None:
+    """The nearest plan that keeps every constraint, for one that nearly does; None for none.
+
+    Steps of least length onto the linearised constraints, whose error falls with its square.
+    """
+    for _ in range(_RESTORATIONS):
+        condensed = at.linearise(plan)
+        program = at.write(plan, condensed, plan.planes)
+        qp, here = program.qp, condensed.here
+        nearby = replace(
+            qp, lower=qp.lower - qp.F @ here, upper=qp.upper - qp.F @ here,
+            b=qp.b - qp.A @ here + tolerance / 2,
+        )  # fmt: skip
+        nobody = np.zeros(len(qp.rows), dtype=np.bool_)
+        end = settled(nearby, nobody.astype(np.intp), nobody, _MOST)
+        if end.solution is None:
+            return None
+        force = np.concatenate([plan.reaction, plan.force])
+        v = here + end.solution.v
+        plan = at.certify(program, replace(end.solution, v=v, force=force, relaxed=nobody))
+        deep = max(plan.residuals.feasibility, float(plan.excess.max(initial=0.0)))
+        if deep <= tolerance and at.screen(plan) is None:
+            return plan
+    return None
 
 
 def summed(solution: QPSolution, factors: FloatArray, step: FloatArray) -> QPSolution | None:

@@ -250,7 +250,8 @@ class SCP:
         if self._between and step.count:
             free_motion = self._nodes.motion(*self._trajectory(free, step))
             wide = self._widened(step, free_motion)
-        if self._is_clear(wide, free) and free.residuals.worst <= self.settings.tolerance:
+        solved = free.residuals.worst <= self.settings.tolerance or not step.count
+        if solved and self._is_clear(wide, free):
             at.step = wide
             return self._plan(wide, Found(self._loop.result(free)), clock)
         at.obstacle_free = at.iterate(free)

@@ -17,7 +17,7 @@ from scp_mpc import (
     Status,
 )
 from scp_mpc.errors import InvalidArgumentError
-from scp_mpc.models import FunctionModel
+from scp_mpc.models import FunctionModel, Unicycle
 from scp_mpc.scp.nodes import LinearNodes
 from scp_mpc.scp.trust_region import TrustRegion
 from scp_mpc.trajectory import rollout
@@ -274,3 +274,40 @@ def test_braking_from_any_heading_stays_clear():
     assert plan.ok
     assert depths(plan, problem, obstacle).min() > 0
     assert abs(plan.X[-1, 3]) < 1e-6
+
+
+def hurried(seed):
+    """A fast unicycle behind a row of discs, with few iterations to get past."""
+    rng = np.random.default_rng(seed)
+    this = Problem(
+        Unicycle(0.2), horizon=20, Q=[1.0, 1.0, 0.01, 0.1], R=[0.05, 0.05], u_min=-2.0, u_max=2.0,
+        robot_radius=0.25, speed_max=2.0, max_obstacles=3, nodes_per_interval=1,
+    )  # fmt: skip
+    things = [ObstaclePrediction.static(20, [2.0 + k, 0.5 * rng.normal()], 0.7) for k in range(3)]
+    x0, goal = np.array([0.0, 0.0, 0.3, 0.5]), np.array([6.5, 0.0, 0.0, 0.0])
+    return this, x0, goal, things
+
+
+def test_a_search_that_ends_early_hands_out_a_plan_that_can_be_followed():
+    """What violates its constraints by a hair is taken back to them: not the brakes."""
+    restored = driving = 0
+    for seed in range(8):
+        this, x0, goal, things = hurried(seed)
+        for most in (10, 20):
+            plan = SCP(this, Settings(max_iterations=most)).solve(x0, goal, things)
+            if plan.status is Status.FEASIBLE:
+                gaps = [np.linalg.norm(plan.X[1:, :2] - o.means[1:], axis=1) for o in things]
+                assert np.min(gaps) >= 0.95 - 1e-6
+                assert plan.X[:, 3].max() <= 2.0 + 1e-6
+                restored += 1
+            assert plan.status.ok
+            driving += plan.X[-1, 0] > 0.5
+    assert restored >= 4
+    assert driving >= 14
+
+
+def test_without_obstacles_a_search_that_ends_early_is_no_reason_to_brake():
+    this, x0, goal, _ = hurried(0)
+    plan = SCP(this, Settings(max_iterations=5)).solve(x0, goal)
+    assert plan.status is Status.FEASIBLE
+    assert plan.X[-1, 0] > 1.0
