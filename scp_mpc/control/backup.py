@@ -60,7 +60,8 @@ class Backup:
         self._body = problem.robot_radius + float(np.abs(problem.discs).max())
         at = problem.model.position
         self._room = problem.x_min[at], problem.x_max[at]
-        self.walled = bool(np.isfinite(self._room).any())
+        self._late = problem.limits_rates and problem.limits_states
+        self.walled = self._late or bool(np.isfinite(self._room).any())
 
     def of(
         self, states: FloatArray, inputs: FloatArray, obstacles: Sequence[ObstaclePrediction]
@@ -75,14 +76,16 @@ class Backup:
         if self._is_far(states[-2:, self._problem.model.position], obstacles):
             return inputs[1:]
         for stage in (len(inputs), 1):
-            stop, path = self.stopping(states[stage])
+            stop, path = self.stopping(states[stage], inputs[stage - 1])
             if self.is_clear(path, stop, obstacles, stage):
                 return inputs[1:stage]
         return None
 
-    def stopping(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inputs (k, nu) that bring the robot to rest from x, and states (k+1, nx)."""
-        return braking(self._problem, x)
+    def stopping(
+        self, x: FloatArray, last: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Inputs (k, nu) to rest from x after the last input, and states (k+1, nx)."""
+        return braking(self._problem, x, last)
 
     def _is_far(self, end: FloatArray, obstacles: Sequence[ObstaclePrediction]) -> bool:
         """Whether nothing can be met while braking, from the last two positions (2, d)."""
@@ -91,6 +94,8 @@ class Backup:
         if speed > self._speeds[-1]:
             return False
         way, time = (_RESERVE * np.interp(speed, self._speeds, part) for part in self._braking)
+        if self._late:  # rates may carry states beyond their bounds
+            return False
         if min((end[1] - self._room[0]).min(), (self._room[1] - end[1]).min()) < way:
             return False
         if not obstacles:

@@ -207,7 +207,8 @@ class MPC:
             return plan, backup
         model, N = self.problem.model, self.problem.horizon
         end = rollout(model.step, plan.X[0], self._backup).states[-1]
-        stop, path = self._backups.stopping(end)
+        before = self._backup[-1] if len(self._backup) else last
+        stop, path = self._backups.stopping(end, before)
         rest = np.tile(model.equilibrium_input, (N, 1))
         inputs = np.concatenate([self._backup, stop, rest])[:N]
         other = self._solver.follow(x0, x_ref, obstacles, inputs, robot_covariance, last)

@@ -4,7 +4,7 @@ All are ranked by the programs that linearise about them. The multipliers that O
 iterations bound a program's optimum from below, and tightly: most candidates are cut off by that,
 and many by the multipliers that the same one had one control step before, without any iteration.
 The best are followed to their end, and win if they are better by enough. Where the plan needs
-slack, all are followed until one does not.
+slack, more are followed until one does not.
 """
 
 from collections import Counter
@@ -33,6 +33,7 @@ from scp_mpc.scp.transcription import Relaxation, Transcription
 
 # It must be better by this share, or the plan flickers between candidates of equal cost.
 _HYSTERESIS = 0.001
+_MOST_UNSAFE = 8  # candidates that are followed where the plan needs slack
 _CUTOFF = 3.0  # times the plan's own merit: more than that one program does not make good
 _BEAM = 3  # candidates among polytopes that are varied
 _ROUNDS = 5  # of variations
@@ -139,8 +140,8 @@ class MultiStart:
             follow += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
         ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
-        # A plan with slack is beaten by any without: then all candidates are worth their time.
-        for one in ranked[:follow] if safe else ranked:
+        # A plan with slack is beaten by any without: then more candidates are worth their time.
+        for one in ranked[: follow if safe else _MOST_UNSAFE]:
             if one.v is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
             if safe and same_pattern(step, about.passing(one), here):

@@ -250,10 +250,10 @@ class SCP:
         if self._between and step.count:
             free_motion = self._nodes.motion(*self._trajectory(free, step))
             wide = self._widened(step, free_motion)
-        solved = free.residuals.worst <= self.settings.tolerance or not step.count
-        if solved and self._is_clear(wide, free):
-            at.step = wide
-            return self._plan(wide, Found(self._loop.result(free)), clock)
+        if self._is_clear(wide, free):
+            at.step, alone = wide, self._loop.result(free)
+            if alone.status.certified or (alone.status.ok and not step.count):
+                return self._plan(wide, Found(alone), clock)
         at.obstacle_free = at.iterate(free)
         # Where the inputs lead from a state that a disturbance has moved says little about sides.
         about = None if last is None else at.outputs(last)

@@ -69,7 +69,8 @@ class TrackerSettings:
             known yet.
         confirmations: Measurements after which a track is told of; the first one says nothing about
             the velocity, so that predictions from it alone are as wide as `speed` makes them.
-        keep: Seconds without a measurement after which a track ends.
+        keep: Seconds without a measurement after which a track ends; longer than the sensor's usual
+            outages, or all tracks begin anew after each, knowing nothing of velocities.
         gate: Probability that the right measurement is near enough to its track to be taken for
             it; where measurements have no names.
         std_inflation: Factor on the standard deviations of all predictions: for obstacles that are
@@ -80,7 +81,7 @@ class TrackerSettings:
     dwell_time: float = 1.3
     speed: float = 1.0
     confirmations: int = 2
-    keep: float = 1.0
+    keep: float = 1.5
     gate: float = 0.999
     std_inflation: float = 1.0
 

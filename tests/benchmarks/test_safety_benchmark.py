@@ -113,6 +113,7 @@ def test_a_blind_controller_is_caught():
     assert not any(row["not_ok"] for row in rows)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_ended(tmp_path):
     main("standing", tmp_path, episodes=1)
     shown = []

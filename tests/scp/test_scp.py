@@ -198,7 +198,7 @@ def test_without_any_solution_the_robot_brakes_within_limits():
     x0 = case.x0 + [0.0, 3.0, 0.0, 0.0]
     guess = Trajectory(case.x_ref, np.tile([7.0, 0.0], (8, 1)))
     plan = SCP(case.problem, DEAD).solve(x0, case.x_ref, case.obstacles, guess)
-    assert plan.status is Status.STOPPING
+    assert plan.status is Status.FALLBACK
     assert not plan.ok
     # Straight ahead, at the limit of the first axis; the second one's share keeps the direction.
     np.testing.assert_allclose(plan.u0, -3.0 * x0[[1, 3]] / x0[1])

@@ -161,13 +161,14 @@ def rebuilt(problem, x0, x_ref, obstacles, inputs, elastic=False, u_last=None, c
                     entries.append((at_u + (i - 1) * nu + a, [-1.0]))
                     least, most = problem.du_min[a], problem.du_max[a]
                 row(least, most, *entries)
+    braked = SCP(problem).brake(x0, x0, u_last=u_last).X if faces else None
     for i in range(N):
         for b, (face, least, most, _) in enumerate(faces):
             entries = [(i * nx, face)]
             if elastic and b in soft:
                 k = i * len(soft) + soft.index(b)
                 entries += [(at_below + k, [couplings[0][k]]), (at_above + k, [-couplings[0][k]])]
-            least, most = widened(problem, x0, u_last, i, face, least, most, b in soft, elastic)
+            least, most = widened(braked, i, face, least, most, b in soft, elastic)
             row(least - face @ x_ref[i + 1], most - face @ x_ref[i + 1], *entries)
     for c, (p, i, by_x, by_u, by_next) in enumerate(where):
         planes = []
@@ -224,13 +225,13 @@ def state_rows(problem):
     return rows
 
 
-def widened(problem, x0, u_last, i, face, least, most, soft, elastic):
+def widened(states, i, face, least, most, soft, elastic):
     """Bounds of a row at stage i + 1, as far as full braking goes where that is beyond."""
-    states = SCP(problem).brake(x0, x0, u_last=u_last).X
-    if not soft and (elastic or face @ x0 > most + 1e-9):
-        most = max(most, face @ states[i + 1])
-    if not soft and (elastic or face @ x0 < least - 1e-9):
-        least = min(least, face @ states[i + 1])
+    here, after = face @ states[0], face @ states[i + 1]
+    if not soft and (elastic or here > most + 1e-9):
+        most = max(most, after)
+    if not soft and (elastic or here < least - 1e-9):
+        least = min(least, after)
     return least, most
 
 

@@ -59,12 +59,12 @@ def test_dropouts_cost_certainty_and_tracks_end():
     follower.update(1.0, [[1.0, 0]], ["a"])
     a, b = follower.predictions()
     assert b.largest_std[0] > a.largest_std[0]
-    follower.update(1.7, [[1.7, 0]], ["a"])
-    assert [o.name for o in follower.predictions()] == ["a", "b"]  # 0.9 s without
-    assert [o.name for o in follower.predictions(1.9)] == ["a"]
-    follower.update(1.9, [], [])
+    follower.update(2.2, [[2.2, 0]], ["a"])
+    assert [o.name for o in follower.predictions()] == ["a", "b"]  # 1.4 s without
+    assert [o.name for o in follower.predictions(2.4)] == ["a"]
+    follower.update(2.4, [], [])
     assert follower.names == ("a",)
-    follower.update(2.0, [[0, 5]], ["b"])
+    follower.update(2.6, [[0, 5]], ["b"])
     assert follower.predictions()[1].largest_std[-1] > 1.0  # b begins anew: its speed is not known
 
 
