@@ -298,7 +298,7 @@ def test_closed_loops_keep_inputs_and_rates_always(solver, targets, steps, seed)
         x = this.model.step(x, last) + 0.02 * rng.normal(size=4)
 
 
-@pytest.mark.parametrize("reach", [0.3, 0.5, 1.0])
+@pytest.mark.parametrize("reach", [0.5, 1.0])
 @pytest.mark.parametrize("speed", [{"speed_max": 2.0}, SPEED], ids=["speed", "axis"])
 def test_slow_rates_never_carry_a_robot_beyond_its_speed(speed, reach):
     """What a plan of one second does not see, its backup does; the model is exact."""
