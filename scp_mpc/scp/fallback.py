@@ -35,19 +35,32 @@ class Fallback:
         """Remember both."""
         self._problem, self._tolerance = problem, tolerance
 
-    def best(self, step: Step, last: Iterate | None, tired: bool = False) -> Result:
-        """The last plan, if it meets every constraint; else braking, whether it does or not.
+    def best(
+        self,
+        step: Step,
+        last: Iterate | None,
+        found: Result | None = None,
+        tired: bool = False,
+    ) -> Result:
+        """The last plan or braking, if it meets every constraint; else what is passively safe.
 
-        Braking comes first for one who is `tired` of the last plan, if that meets them all.
+        Args:
+            step: The step.
+            last: The last plan, shifted; or None.
+            found: What a search ended with, that does not meet every constraint; or None.
+            tired: Whether braking comes before the last plan.
         """
-        if tired:
-            brake = self.brake(step)
-            if brake.status.ok or last is None:
-                return brake
         kept = None if last is None else self.keep(step, last.inputs)
-        return kept if kept is not None and kept.status.ok else self.brake(step)
+        if kept is not None and kept.status.ok and not tired:
+            return kept
+        brake = self.brake(step)
+        if brake.status.ok:
+            return brake
+        if kept is not None and kept.status.ok:
+            return kept
+        return self.stopping(step, brake, found, kept)
 
-    def stopping(self, step: Step, *plans: Result | None) -> Result:
+    def stopping(self, step: Step, brake: Result, *plans: Result | None) -> Result:
         """The first plan, or the longest head of one followed by braking, that is passively safe.
 
         Passively safe is who violates nothing, or no faster than full braking from now on would
@@ -58,9 +71,10 @@ class Fallback:
 
         Args:
             step: The step.
+            brake: Braking from now on.
             plans: With slack, or not feasible, in order of preference.
         """
-        problem, brake = self._problem, self.brake(step)
+        problem = self._problem
         known = [plan for plan in plans if plan is not None]
         for plan in known:
             if self._is_passive(step, plan, brake):

@@ -139,7 +139,9 @@ class SCP:
                 return self._solve(step, clock, nominal, multi_start, tired)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
-                return self._plan(step, Found(self._fallback.best(step, nominal, tired)), clock)
+                return self._plan(
+                    step, Found(self._fallback.best(step, nominal, None, tired)), clock
+                )
         finally:
             self._busy.release()
 
@@ -267,7 +269,7 @@ class SCP:
             best = None
             if step.count and clock.allows("iteration"):
                 best = self._loop.run(at.at(start, about=about), about=about)
-            found = Found(best or self._fallback.best(step, last, tired))
+            found = Found(best or self._fallback.best(step, last, None, tired))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
             if isinstance(self.problem.margin, JointRisk):
@@ -281,9 +283,8 @@ class SCP:
                 break
             start, about = found.best.iterate, None
         else:
-            found = replace(
-                found, best=self._known(step, last, self._exposed(step, found.best), tired)
-            )
+            exposed = self._exposed(step, found.best)
+            found = replace(found, best=self._fallback.best(step, last, exposed, tired))
         plan = self._plan(at.step, found, clock)
         clock.learn("ending", ending)
         return plan
@@ -319,22 +320,14 @@ class SCP:
             plan = start if found is None or found.nominal is None else found.nominal
         return plan
 
-    def _known(self, step: Step, last: Iterate | None, best: Result, tired: bool) -> Result:
-        """The last plan or braking, if it holds every constraint; else what is passively safe."""
-        known = self._fallback.best(step, last, tired)
-        if known.status.ok:
-            return known
-        kept = None if last is None else self._fallback.keep(step, last.inputs)
-        return self._fallback.stopping(step, best if best.nominal is not None else None, kept)
-
     def _rescued(self, step: Step, last: Iterate | None, best: Result, tired: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.
 
         What is known is judged by its own motion between the nodes, and so is what it leads to.
         """
-        if best.status.ok:
+        if best.status.ok or best.nominal is None:
             return best
-        known = self._known(step, last, best, tired)
+        known = self._fallback.best(step, last, best, tired)
         if not known.status.ok:
             return known
         own = self._motion(known.iterate)
