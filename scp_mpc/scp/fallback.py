@@ -50,14 +50,15 @@ class Fallback:
             found: What a search ended with, that does not meet every constraint; or None.
             tired: Whether braking comes before the last plan.
         """
-        kept = None if last is None else self.keep(step, last.inputs)
-        if kept is not None and kept.status.ok and not tired:
-            return kept
-        brake = self.brake(step)
-        if brake.status.ok:
+        brake = self.brake(step) if tired or last is None else None
+        if brake is not None and brake.status.ok:
             return brake
+        kept = None if last is None else self.keep(step, last.inputs)
         if kept is not None and kept.status.ok:
             return kept
+        brake = self.brake(step) if brake is None else brake
+        if brake.status.ok:
+            return brake
         return self.stopping(step, brake, found, kept)
 
     def stopping(self, step: Step, brake: Result, *plans: Result | None) -> Result:

@@ -269,12 +269,14 @@ class SCP:
             best = None
             if step.count and clock.allows("iteration"):
                 best = self._loop.run(at.at(start, about=about), about=about)
+            ending = clock.mark()
             found = Found(best or self._fallback.best(step, last, None, tired))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
-            if isinstance(self.problem.margin, JointRisk):
+                ending = clock.mark()
+            if best is not None and isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
-            ending = clock.mark()
+                ending = clock.mark()
             best = self._rescued(step, last, found.best, tired)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
                 best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))
