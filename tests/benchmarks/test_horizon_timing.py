@@ -49,6 +49,7 @@ def test_everybody_has_a_row_per_horizon(tmp_path):
         assert (row["programs"] is not None) == row["solver"].startswith("scp_mpc")
 
 
+@pytest.mark.slow
 def test_without_casadi_its_row_says_so(tmp_path):
     (tmp_path / "casadi.py").write_text("raise ImportError('not here')")
     cells, rows = run(tmp_path, 1, PYTHONPATH=str(tmp_path))

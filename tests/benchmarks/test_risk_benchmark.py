@@ -217,11 +217,11 @@ def test_promises_are_checked():
 
 def test_closed_loop_counts_episodes_in_contact():
     settings = [RiskSetting("stage", 0.05, "exact"), RiskSetting("stage", 0.05, "exact", 0.01)]
-    careful, careless = risk.closed_loop(12, 0, settings)
-    assert careful["episodes"] == careless["episodes"] == 12
+    careful, careless = risk.closed_loop(8, 0, settings)
+    assert careful["episodes"] == careless["episodes"] == 8
     assert careful["contacts"] < careless["contacts"]
-    assert careless["steps"] < careful["steps"] <= 12 * risk_episodes.STEPS
-    assert "| stage | exact | 0.05 | 12 |" in markdown([], [careful])
+    assert careless["steps"] < careful["steps"] <= 8 * risk_episodes.STEPS
+    assert "| stage | exact | 0.05 | 8 |" in markdown([], [careful])
 
 
 def test_encounters_are_consistent_with_their_predictions():

@@ -186,7 +186,7 @@ def equal(first, second):
     )
 
 
-@pytest.mark.parametrize("examples", [40, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [25, pytest.param(100, marks=pytest.mark.slow)])
 def test_any_sequence_of_calls(examples):
     run_state_machine_as_test(
         Control,
