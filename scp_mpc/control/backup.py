@@ -1,4 +1,4 @@
-"""The backup of a plan: its inputs, or the first of them, then braking to rest.
+"""The backup of a plan: its inputs, or a head of them, then braking to rest.
 
 A plan is checked up to its horizon only: it may end at speed, right in front of something. So the
 way to rest from its end is checked, too, against the predictions carried on beyond their last row:
@@ -29,7 +29,7 @@ from scp_mpc.scp.step import Step
 
 _SECONDS = 4.0  # of braking that are looked at, at least
 _SPEEDS = 2.0 ** np.arange(-3, 5)  # [m/s] from which braking is tried out
-_AT_REST = 0.05  # [m/s] of the position after braking, where it does not end sooner
+_AT_REST = 0.15  # [m/s] of the position after that, where braking fades out and does not end sooner
 _RESERVE = 1.5  # of way and time of braking over those straight on
 
 
@@ -75,7 +75,8 @@ class Backup:
         """
         if self._is_far(states[-2:, self._problem.model.position], obstacles):
             return inputs[1:]
-        for stage in (len(inputs), 1):
+        whole = len(inputs)
+        for stage in dict.fromkeys((whole, whole // 2 or 1, whole // 4 or 1, 1)):
             stop, path = self.stopping(states[stage], inputs[stage - 1])
             if self.is_clear(path, stop, obstacles, stage):
                 return inputs[1:stage]

@@ -100,7 +100,7 @@ def test_who_is_far_or_not_near_is_never_met():
     assert min(far, near, blocked) >= 3
 
 
-def test_a_backup_is_the_plan_or_its_first_input():
+def test_a_backup_is_the_plan_or_a_head_of_it():
     lengths = set()
     for seed in range(60):
         backup, states, inputs, obstacles = scene(seed)
@@ -108,7 +108,7 @@ def test_a_backup_is_the_plan_or_its_first_input():
         if known is not None:
             np.testing.assert_array_equal(known, inputs[1 : 1 + len(known)])
         lengths.add(None if known is None else len(known))
-    assert lengths == {None, 0, 7}
+    assert {None, 0, 7} <= lengths <= {None, 0, 1, 3, 7}
 
 
 def test_its_time_counts(monkeypatch):
