@@ -29,7 +29,7 @@ from scp_mpc.scp.step import Step
 
 _SECONDS = 4.0  # of braking that are looked at, at least
 _SPEEDS = 2.0 ** np.arange(-3, 5)  # [m/s] from which braking is tried out
-_AT_REST = 0.15  # [m/s] of the position after that, where braking fades out and does not end sooner
+_AT_REST, _FADED = 0.05, 0.15  # [m/s] of the position after that; of one whose braking fades out
 _RESERVE = 1.5  # of way and time of braking over those straight on
 
 
@@ -45,6 +45,7 @@ class Backup:
         """Lay out the nodes of the time after a plan."""
         stages = max(problem.horizon, int(np.ceil(_SECONDS / problem.model.dt)))
         self._problem, self._tolerance = replace(problem, horizon=stages), tolerance
+        self._late = problem.limits_rates and problem.limits_states
         self._nodes = Nodes.of(self._problem)
         self._fallback = Fallback(self._problem, tolerance)
         start, table = np.zeros(problem.model.dim), [(0.0, 0.0, 0.0)]
@@ -60,7 +61,6 @@ class Backup:
         self._body = problem.robot_radius + float(np.abs(problem.discs).max())
         at = problem.model.position
         self._room = problem.x_min[at], problem.x_max[at]
-        self._late = problem.limits_rates and problem.limits_states
         self.walled = self._late or bool(np.isfinite(self._room).any())
 
     def of(
@@ -142,7 +142,8 @@ class Backup:
         """Whether so many inputs come to rest within the time that is looked at."""
         if count < self._problem.horizon:
             return True
-        return float(np.linalg.norm(path[-1] - path[-2])) <= _AT_REST * self._problem.model.dt
+        rest = _AT_REST if self._late else _FADED  # rates let braking swing
+        return float(np.linalg.norm(path[-1] - path[-2])) <= rest * self._problem.model.dt
 
     def _near(
         self, path: FloatArray, obstacles: Sequence[ObstaclePrediction], stage: int
