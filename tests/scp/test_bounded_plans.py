@@ -151,7 +151,7 @@ def test_a_hard_bound_is_what_full_braking_reaches(solver, limit):
 
 @paths
 @pytest.mark.parametrize("kind", ["point", "unicycle"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_obstacles_yield_before_the_speed_does(solver, kind, seed):
     """Somebody comes too fast to be let pass: no plan is faster than allowed, with slack or not."""
     rng, faces = np.random.default_rng(seed), np.pi / 16

@@ -271,7 +271,7 @@ def walker(gap, speed, N, dt=0.2):
 @pytest.mark.parametrize("nodes", [1, 4])
 def test_plans_that_are_not_ok_are_passively_safe(nodes):
     """Nowhere faster than braking where they violate anything, whatever comes from where."""
-    assert sum(passive(seed, nodes) for seed in range(12)) >= 12
+    assert sum(passive(seed, nodes) for seed in range(8)) >= 8
 
 
 def passive(seed, nodes):
