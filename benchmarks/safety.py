@@ -24,8 +24,8 @@ from benchmarks.progress import progress
 from benchmarks.safety_search import is_reachable
 from benchmarks.safety_worlds import SHARES, Drive, World, drive
 from benchmarks.tables import table, write
+from scp_mpc.scp.braking import AT_REST
 from scp_mpc.simulation.episodes import run_episodes
-from scp_mpc.simulation.events import AT_REST
 
 EPISODES = 2000
 TOUCHING = -1e-5  # [m], beyond the tolerance of the plans and of the judge

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from math import inf
 from time import perf_counter, thread_time
 
@@ -30,44 +31,58 @@ class Pace:
 
     def __init__(self) -> None:
         """Know nothing: everything is expected to take no time."""
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._measured: defaultdict[str, int] = defaultdict(int)
-        self._stalled: set[str] = set()
-        self._refused: defaultdict[str, int] = defaultdict(int)
-        self._patience: defaultdict[str, int] = defaultdict(lambda: _PATIENCE)
-        self._tried: set[str] = set()
+        self._tasks: defaultdict[str, _Task] = defaultdict(_Task)
 
     def expected(self, task: str) -> float:
         """Predicted seconds."""
-        return 0.0 if task in self._tried else self._seconds[task]
+        known = self._tasks[task]
+        return 0.0 if known.on_trial else known.seconds
 
     def learn(self, task: str, seconds: float, worked: float = inf) -> None:
         """Take note of a measured time, and of the processor time within it."""
-        known, self._measured[task] = self._seconds[task], self._measured[task] + 1
-        if task in self._tried:
-            slow = seconds > known / 2
-            self._patience[task] = (
-                min(2 * self._patience[task], _MOST_PATIENCE) if slow else _PATIENCE
-            )
-            self._tried.discard(task)
-            known = known if slow else 0.0
-        believed = min(seconds, worked, _HICCUP * known if known else inf)
-        if seconds > _HICCUP * worked + _LEAST or (known and seconds > _HICCUP * known + _LEAST):
-            again = task in self._stalled
-            self._stalled.add(task)
-            seconds = seconds if again else believed
-        else:
-            self._stalled.discard(task)
-        share = max(_FORGET, 1 / self._measured[task])
-        self._seconds[task] = max(seconds, known - share * (known - seconds))
+        one = self._tasks[task]
+        one.measured += 1
+        if one.on_trial:
+            one.on_trial = False
+            if seconds > one.seconds / 2:
+                one.patience = min(2 * one.patience, _MOST_PATIENCE)
+            else:
+                one.patience, one.seconds = _PATIENCE, 0.0
+        usual = _HICCUP * one.seconds if one.seconds else inf
+        twice, one.stalled = one.stalled, seconds > min(usual, _HICCUP * worked) + _LEAST
+        if one.stalled and not twice:
+            seconds = min(seconds, worked, usual)
+        share = max(_FORGET, 1 / one.measured)
+        one.seconds = max(seconds, one.seconds - share * (one.seconds - seconds))
 
     def refused(self, task: str, never: bool) -> None:
         """Note that a task was not begun; `never`, if by what is known no step has room for it."""
-        self._seconds[task] *= _EASE
-        self._refused[task] += never
-        if self._refused[task] >= self._patience[task]:
-            self._refused[task] = 0
-            self._tried.add(task)
+        one = self._tasks[task]
+        one.seconds *= _EASE
+        one.refused += never
+        if one.refused >= one.patience:
+            one.refused, one.on_trial = 0, True
+
+
+@dataclass
+class _Task:
+    """What is known of a task.
+
+    Attributes:
+        seconds: Its longest time lately.
+        measured: How often it was measured.
+        stalled: Whether the last time was far longer than all before.
+        refused: How often it was not begun, since it was tried last, for being too long.
+        patience: How often it may be.
+        on_trial: Whether it is to be begun, whatever is known.
+    """
+
+    seconds: float = 0.0
+    measured: int = 0
+    stalled: bool = False
+    refused: int = 0
+    patience: int = _PATIENCE
+    on_trial: bool = False
 
 
 class Clock:
@@ -130,7 +145,7 @@ class Clock:
     def room(self, task: str, most: int, then: str = "") -> int:
         """How often, up to `most` times, a task fits in before another one, as predicted."""
         if task in _COUNTED:
-            most = min(most, int(min(self._programs, most)))
+            most = int(min(self._programs, most))
         if self._deadline == inf:
             return most
         after = self._pace.expected(then) + self._pace.expected("ending")

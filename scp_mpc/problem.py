@@ -326,6 +326,11 @@ class Problem:
             return np.zeros_like(x)
         return np.maximum(0.0, np.maximum(x - self.x_max, self.x_min - x))
 
+    def row_excess(self, states: FloatArray) -> FloatArray:
+        """Return by how much E x is outside its bounds at stages 1 .. N (N, nb), speed included."""
+        (lower, upper), rows = self.row_bounds, states[1:] @ self.state_rows.T
+        return np.maximum(0.0, np.maximum(lower - rows, rows - upper))
+
     def penalty(self, slack: FloatArray, states: FloatArray) -> float:
         """Return the price of the obstacles' slack [m] and of the excess of states (N+1, nx)."""
         price = self.slack_weight * float(slack.sum())

@@ -6,11 +6,12 @@ way to rest from its end is checked, too, against the predictions carried on bey
     mean        goes on at the velocity of the last interval
     covariance  goes on growing in the directions in which it grew last, and never shrinks
 
-A plan whose own way to rest is not clear is followed as long as the robot can still brake after its
-first input. Where that is not clear either, and an earlier plan's backup is, the robot follows that
-one: if its model is exact and the world does what was predicted, it stays clear, stage by stage, so
-that a plan that is ok is followed by one that is (the safety filter of Wabersich and Zeilinger,
-2018, with braking for the terminal set). What comes near a robot at rest is not its doing.
+A plan whose own way to rest is not clear is followed as long as the robot can still brake after a
+head of it, its first input at least. Where that is not clear either, and an earlier plan's backup
+is, the robot follows that one: if its model is exact and the world does what was predicted, it
+stays clear, stage by stage, so that a plan that is ok is followed by one that is (the safety filter
+of Wabersich and Zeilinger, 2018, with braking for the terminal set). What comes near a robot at
+rest is not its doing.
 """
 
 from collections.abc import Sequence
@@ -22,14 +23,15 @@ from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.obstacles.propagation import positive_part
 from scp_mpc.problem import Problem
-from scp_mpc.scp.braking import braking
+from scp_mpc.scp.braking import AT_REST, braking
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
+from scp_mpc.trajectory import rollout
 
 _SECONDS = 4.0  # of braking that are looked at, at least
 _SPEEDS = 2.0 ** np.arange(-3, 5)  # [m/s] from which braking is tried out
-_AT_REST, _FADED = 0.05, 0.15  # [m/s] of the position after that; of one whose braking fades out
+_FADED = 0.15  # [m/s] that is rest where braking fades out and does not end within that time
 _RESERVE = 1.5  # of way and time of braking over those straight on
 
 
@@ -39,13 +41,18 @@ class Backup:
     Args:
         problem: What they are judged by.
         tolerance: Violation that is none [m].
+
+    Attributes:
+        always: Whether bounds of states ask for one without any obstacle, too.
     """
 
     def __init__(self, problem: Problem, tolerance: float) -> None:
         """Lay out the nodes of the time after a plan."""
+        self._planned = problem.horizon
         stages = max(problem.horizon, int(np.ceil(_SECONDS / problem.model.dt)))
         self._problem, self._tolerance = replace(problem, horizon=stages), tolerance
-        self._late = problem.limits_rates and problem.limits_states
+        # Limited rates carry states on beyond their bounds, and let braking swing.
+        self._swings = problem.limits_rates and problem.limits_states
         self._nodes = Nodes.of(self._problem)
         self._fallback = Fallback(self._problem, tolerance)
         start, table = np.zeros(problem.model.dim), [(0.0, 0.0, 0.0)]
@@ -61,7 +68,7 @@ class Backup:
         self._body = problem.robot_radius + float(np.abs(problem.discs).max())
         at = problem.model.position
         self._room = problem.x_min[at], problem.x_max[at]
-        self.walled = self._late or bool(np.isfinite(self._room).any())
+        self.always = self._swings or bool(np.isfinite(self._room).any())
 
     def of(
         self, states: FloatArray, inputs: FloatArray, obstacles: Sequence[ObstaclePrediction]
@@ -88,15 +95,36 @@ class Backup:
         """Inputs (k, nu) to rest from x after the last input, and states (k+1, nx)."""
         return braking(self._problem, x, last)
 
+    def continued(
+        self,
+        x: FloatArray,
+        inputs: FloatArray,
+        last: FloatArray | None,
+        obstacles: Sequence[ObstaclePrediction],
+    ) -> FloatArray | None:
+        """Inputs (N, nu) of an earlier backup and its braking; None if that is not clear any more.
+
+        Args:
+            x: (nx,) state now.
+            inputs: (k, nu) what is left of its plan.
+            last: (nu,) input last applied, or None.
+            obstacles: Predictions, row 0 now.
+        """
+        model, stage = self._problem.model, len(inputs)
+        end = rollout(model.step, x, inputs).states[-1]
+        stop, path = self.stopping(end, inputs[-1] if stage else last)
+        if not self.is_clear(path, stop, obstacles, stage):
+            return None
+        rest = np.tile(model.equilibrium_input, (self._planned, 1))
+        return np.concatenate([inputs, stop, rest])[: self._planned]
+
     def _is_far(self, end: FloatArray, obstacles: Sequence[ObstaclePrediction]) -> bool:
         """Whether nothing can be met while braking, from the last two positions (2, d)."""
         dt = self._problem.model.dt
         speed = float(np.linalg.norm(end[1] - end[0])) / dt
-        if speed > self._speeds[-1]:
+        if speed > self._speeds[-1] or self._swings:
             return False
         way, time = (_RESERVE * np.interp(speed, self._speeds, part) for part in self._braking)
-        if self._late:  # rates may carry states beyond their bounds
-            return False
         if min((end[1] - self._room[0]).min(), (self._room[1] - end[1]).min()) < way:
             return False
         if not obstacles:
@@ -125,7 +153,8 @@ class Backup:
         k, path = len(inputs), states[:, self._problem.model.position]
         if k == 0:
             return True
-        if not self._rests(path, k) or self._problem.excess(states).max() > self._tolerance:
+        outside = self._problem.row_excess(states)[:, ~self._problem.soft_rows]
+        if not self._rests(path, k) or outside.max(initial=0.0) > self._tolerance:
             return False
         if not obstacles:
             return True
@@ -142,7 +171,7 @@ class Backup:
         """Whether so many inputs come to rest within the time that is looked at."""
         if count < self._problem.horizon:
             return True
-        rest = _AT_REST if self._late else _FADED  # rates let braking swing
+        rest = AT_REST if self._swings else _FADED
         return float(np.linalg.norm(path[-1] - path[-2])) <= rest * self._problem.model.dt
 
     def _near(

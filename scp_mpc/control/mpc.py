@@ -28,7 +28,6 @@ from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
 from scp_mpc.scp.step import Step
 from scp_mpc.settings import Settings
-from scp_mpc.trajectory import rollout
 
 _log = logging.getLogger(__name__)
 
@@ -135,7 +134,7 @@ class MPC:
                 last = as_array("u_last", u_last, (self.problem.model.nu,))
             plan = self._plan(x0, x_ref, recall, robot_covariance, clock, last)
             backup = None
-            ahead = bool(recall.obstacles) or self._backups.walled
+            ahead = bool(recall.obstacles) or self._backups.always
             if recall.stale is None and ahead and clock.allows("backup"):
                 with clock.task("backup"):
                     given = x0, x_ref, recall.obstacles, robot_covariance, last
@@ -183,7 +182,7 @@ class MPC:
             return self._solver.solve_from(
                 *(x0, x_ref, recall.obstacles, self.nominal(), due),
                 *(robot_covariance, clock, last),
-                tired=self.replayed >= self.settings.max_replayed,
+                brake_first=self.replayed >= self.settings.max_replayed,
             )
         if self.settings.staleness.beyond == "refuse":
             raise recall.stale
@@ -205,15 +204,11 @@ class MPC:
         backup = self._backups.of(plan.X, plan.U, obstacles) if plan.status.ok else None
         if backup is not None or self._backup is None:
             return plan, backup
-        model, N = self.problem.model, self.problem.horizon
-        end = rollout(model.step, plan.X[0], self._backup).states[-1]
-        before = self._backup[-1] if len(self._backup) else last
-        stop, path = self._backups.stopping(end, before)
-        rest = np.tile(model.equilibrium_input, (N, 1))
-        inputs = np.concatenate([self._backup, stop, rest])[:N]
+        inputs = self._backups.continued(plan.X[0], self._backup, last, obstacles)
+        if inputs is None:
+            return plan, None
         other = self._solver.follow(x0, x_ref, obstacles, inputs, robot_covariance, last)
-        stage = len(self._backup)
-        if not (other.status.ok and self._backups.is_clear(path, stop, obstacles, stage)):
+        if not other.status.ok:
             return plan, None
         free = plan.iterate.obstacle_free or plan.iterate
         other = replace(other, iterate=replace(other.iterate, obstacle_free=free))

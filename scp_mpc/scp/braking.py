@@ -9,7 +9,8 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 
-_AT_REST = 1e-9  # of an input, in its own unit, that is none
+AT_REST = 0.05  # [m/s] at which a robot counts as standing
+_NO_INPUT = 1e-9  # of an input, in its own unit
 
 
 def braking(
@@ -42,11 +43,11 @@ def resting_input(problem: Problem) -> FloatArray:
 def _stop(problem: Problem, x: FloatArray, rest: FloatArray) -> FloatArray | None:
     """The input (nu,) that stops the robot, as far as the bounds allow; None at rest."""
     wanted = problem.model.stopping_input(x) - rest
-    if not float(np.abs(wanted).max()) > _AT_REST:  # or NaN
+    if not float(np.abs(wanted).max()) > _NO_INPUT:  # or NaN
         return None
     # In the direction of what is wanted; inputs without any room stay where they are.
     room = np.where(wanted > 0, problem.u_max - rest, problem.u_min - rest)
-    none = np.abs(room) <= _AT_REST
+    none = np.abs(room) <= _NO_INPUT
     wanted, room = np.where(none, 0.0, wanted), np.where(none, 1.0, room)
     stop: FloatArray = rest + wanted / max(1.0, float((wanted / room).max()))
     return stop

@@ -14,12 +14,11 @@ import numpy as np
 from scp_mpc.arrays import FloatArray
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import KKTResiduals
-from scp_mpc.scp.braking import braking, resting_input
+from scp_mpc.scp.braking import AT_REST, braking, resting_input
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Result, Status
 from scp_mpc.scp.step import Step
 
-_AT_REST = 0.05  # [m/s] at which a robot counts as standing
 _STANDS = 0.3  # [m/s] up to which an obstacle does, whose velocity is estimated
 
 
@@ -40,7 +39,7 @@ class Fallback:
         step: Step,
         last: Iterate | None,
         found: Result | None = None,
-        tired: bool = False,
+        brake_first: bool = False,
     ) -> Result:
         """The last plan or braking, if it meets every constraint; else what is passively safe.
 
@@ -48,9 +47,9 @@ class Fallback:
             step: The step.
             last: The last plan, shifted; or None.
             found: What a search ended with, that does not meet every constraint; or None.
-            tired: Whether braking comes before the last plan.
+            brake_first: Whether braking comes before the last plan.
         """
-        brake = self.brake(step) if tired or last is None else None
+        brake = self.brake(step) if brake_first or last is None else None
         if brake is not None and brake.status.ok:
             return brake
         kept = None if last is None else self.keep(step, last.inputs)
@@ -92,17 +91,21 @@ class Fallback:
                 if self._is_passive(step, tried, brake):
                     return tried
         deep = self._stages(step, brake).max(axis=0, initial=0.0) > self._tolerance
-        if (self._ways(brake)[deep] <= _AT_REST * problem.model.dt).all():
+        if (self._ways(brake)[deep] <= AT_REST * problem.model.dt).all():
             return replace(brake, status=Status.STOPPING)
         return brake
 
     def _is_passive(self, step: Step, plan: Result, brake: Result) -> bool:
         """Whether a plan is as slow as braking where it violates anything, or leaves it."""
-        excess, tolerance = step.hard_excess, self._tolerance
-        if excess(plan.iterate.states) > excess(brake.iterate.states) + tolerance:
+        tolerance, hard = self._tolerance, ~self._problem.soft_rows
+        excess, most = (
+            self._problem.row_excess(one.iterate.states)[:, hard].max(initial=0.0)
+            for one in (plan, brake)
+        )
+        if plan.residuals.feasibility == np.inf or excess > most + tolerance:
             return False
         depths, dt = self._stages(step, plan), self._problem.model.dt
-        slow = self._ways(plan) <= self._ways(brake) + _AT_REST * dt
+        slow = self._ways(plan) <= self._ways(brake) + AT_REST * dt
         leaves = depths <= self._stages(step, brake) + tolerance
         leaves[:, 1:] &= depths[:, 1:] <= depths[:, :-1] + tolerance
         means = step.means[:, :: step.nodes.count]
@@ -143,7 +146,6 @@ class Fallback:
         lost = ~np.isfinite(states).all(axis=1)
         if lost.any():  # where the model has no next state, it stays in the last one
             states[lost] = states[int(lost.argmax()) - 1]
-            status = Status.FALLBACK if status.ok else status
         s = np.full(problem.max_obstacles, problem.size.reference)
         s[: step.count] = problem.size.lower  # all that a plan without a search can promise
         if step.count and step.nodes.instants > 1:  # between them it is judged by its own motion
@@ -151,7 +153,10 @@ class Fallback:
             step = step.widened(step.nodes.radii(step.radii, step.drift, motion))
         slack = np.zeros((problem.max_obstacles, step.nodes.size))
         slack[: step.count] = step.depths(step.nodes.positions(states, inputs), s)
-        most = float(np.maximum(slack.max(initial=0.0), step.excess(states)))  # or NaN
+        outside = problem.row_excess(states).max(initial=0.0)
+        most = (
+            np.inf if lost.any() else float(np.maximum(slack.max(initial=0.0), outside))
+        )  # or NaN
         if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
         cost = problem.cost(states, inputs, s, step.x_ref)

@@ -7,7 +7,8 @@
     multi-start  where an obstacle shapes the plan, the same from paths on its other sides;
                  the best plan wins, if by enough
     allocate     where a joint risk is promised, give it to those who need it, and go on
-    fallback     without a plan that meets every constraint, the previous one, or braking
+    fallback     without a plan that meets every constraint, the previous one, or braking, or what
+                 is no faster than braking where it violates one
 
 Between the nodes of a plan radii leave room for what its motion there is assumed to be; a plan that
 moves otherwise is sought again, with what it does for the assumption.
@@ -121,12 +122,12 @@ class SCP:
         robot_covariance: ArrayLike | None = None,
         clock: Clock | None = None,
         u_last: ArrayLike | None = None,
-        tired: bool = False,
+        brake_first: bool = False,
     ) -> Plan:
         """`solve`, with an iterate that is known to fit, and a clock that may run.
 
-        Where nothing better is found in time, the last plan is followed unless one is `tired` of
-        it: then braking comes first.
+        Where nothing better is found in time, the last plan is followed, or with
+        `brake_first` braking if that meets every constraint, too.
         """
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
@@ -136,11 +137,11 @@ class SCP:
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
             )
             try:
-                return self._solve(step, clock, nominal, multi_start, tired)
+                return self._solve(step, clock, nominal, multi_start, brake_first)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 _log.exception("a computation broke down: the last plan, or braking")
                 return self._plan(
-                    step, Found(self._fallback.best(step, nominal, None, tired)), clock
+                    step, Found(self._fallback.best(step, nominal, None, brake_first)), clock
                 )
         finally:
             self._busy.release()
@@ -243,7 +244,7 @@ class SCP:
             )
 
     def _solve(
-        self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool, tired: bool
+        self, step: Step, clock: Clock, last: Iterate | None, multi_start: bool, brake_first: bool
     ) -> Plan:
         at = self._at
         at.begin(step, clock)
@@ -270,14 +271,14 @@ class SCP:
             if step.count and clock.allows("iteration"):
                 best = self._loop.run(at.at(start, about=about), about=about)
             ending = clock.mark()
-            found = Found(best or self._fallback.best(step, last, None, tired))
+            found = Found(best or self._fallback.best(step, last, None, brake_first))
             if self._multi_start.wanted(found.best, multi_start):
                 found = self._multi_start.run(found.best, at.path(free.y)[1:], last)
                 ending = clock.mark()
             if best is not None and isinstance(self.problem.margin, JointRisk):
                 found = replace(found, best=allocate(at, self._loop, found.best))
                 ending = clock.mark()
-            best = self._rescued(step, last, found.best, tired)
+            best = self._rescued(step, last, found.best, brake_first)
             if best.iterate.multipliers is None:  # from here the next obstacle-free plan is sought
                 best = replace(best, iterate=replace(best.iterate, obstacle_free=at.obstacle_free))
             found = replace(found, best=best)
@@ -286,7 +287,7 @@ class SCP:
             start, about = found.best.iterate, None
         else:
             exposed = self._exposed(step, found.best)
-            found = replace(found, best=self._fallback.best(step, last, exposed, tired))
+            found = replace(found, best=self._fallback.best(step, last, exposed, brake_first))
         plan = self._plan(at.step, found, clock)
         clock.learn("ending", ending)
         return plan
@@ -322,14 +323,14 @@ class SCP:
             plan = start if found is None or found.nominal is None else found.nominal
         return plan
 
-    def _rescued(self, step: Step, last: Iterate | None, best: Result, tired: bool) -> Result:
+    def _rescued(self, step: Step, last: Iterate | None, best: Result, brake_first: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.
 
         What is known is judged by its own motion between the nodes, and so is what it leads to.
         """
         if best.status.ok or best.nominal is None:
             return best
-        known = self._fallback.best(step, last, best, tired)
+        known = self._fallback.best(step, last, best, brake_first)
         if not known.status.ok:
             return known
         own = self._motion(known.iterate)

@@ -235,18 +235,6 @@ class Step:
             upper = np.where(high, np.maximum(upper, after), upper)
         return lower, upper
 
-    def excess(self, states: FloatArray) -> float:
-        """By how much states (N+1, nx) are outside the bounds of E x at most; 0 for nowhere."""
-        return float(self._excesses(states).max(initial=0.0))  # or NaN
-
-    def hard_excess(self, states: FloatArray) -> float:
-        """The same of rows that must not yield."""
-        return float(self._excesses(states)[:, ~self.problem.soft_rows].max(initial=0.0))
-
-    def _excesses(self, states: FloatArray) -> FloatArray:
-        (lower, upper), after = self.row_bounds(), states[1:] @ self.problem.state_rows.T
-        return np.maximum(lower - after, after - upper)
-
     def path(self, away: FloatArray) -> FloatArray:
         """Positions (C+1, d) [m] from now on, given those of the nodes (C d,) relative to now."""
         here = self.here

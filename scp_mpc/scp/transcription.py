@@ -105,8 +105,8 @@ class Transcription:
         self.step, self.clock, self.obstacle_free = step, clock, None
         self.condenser.begin(step)
         self.bounds = self.layout.bounds(step)
-        self._near = self.layout.bounds(step, "outside") if step.is_outside else self.bounds
-        self._far: tuple[FloatArray, FloatArray] | None = None
+        self._strict = self.layout.bounds(step, "outside") if step.is_outside else self.bounds
+        self._braked: tuple[FloatArray, FloatArray] | None = None
         self.no_pairs = Pairs(step, self.layout, np.zeros(step.radii.shape, dtype=np.bool_))
         for subproblem in (self.hard, self.elastic):
             subproblem.solver.finished, subproblem.about = Counter(), None
@@ -332,14 +332,14 @@ class Transcription:
     def relaxed_bounds(self, relaxation: Relaxation) -> tuple[FloatArray, FloatArray]:
         """Bounds (ny,) of y in a program of some kind."""
         if relaxation is Relaxation.NONE or not self.layout.limits_states:
-            return self._near
-        if self._far is None:
-            self._far = self.layout.bounds(self.step, "all")
-        return self._far
+            return self._strict
+        if self._braked is None:
+            self._braked = self.layout.bounds(self.step, "all")
+        return self._braked
 
     def _states_yield(self) -> bool:
-        far = self.relaxed_bounds(Relaxation.STATES)
-        return len(self.layout.soft) > 0 or not all(map(np.array_equal, self._near, far))
+        braked = self.relaxed_bounds(Relaxation.STATES)
+        return len(self.layout.soft) > 0 or not all(map(np.array_equal, self._strict, braked))
 
     def certify(self, program: Program, solution: QPSolution) -> Nominal:
         """Roll a solution out and certify it against the original problem."""

@@ -17,11 +17,11 @@ from typing import Literal
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
+from scp_mpc.scp.braking import AT_REST
 from scp_mpc.simulation.contact import FINE
 from scp_mpc.simulation.run import Run, disc_centres, separation
 
-AT_REST = 0.05  # [m/s]
-CLOSING = 0.3  # [m/s]
+_CLOSING = 0.3  # [m/s]
 _APART = 1.0  # [s] without touching after which the next contact is another one
 
 
@@ -126,7 +126,7 @@ def _contact(run: Run, body: int, step: int, piece: int, depth: float) -> Contac
     kind: Literal["at rest", "struck", "at fault"] = "struck"
     if speed <= AT_REST:
         kind = "at rest"
-    elif closing > CLOSING and closing > other:
+    elif closing > _CLOSING and closing > other:
         kind = "at fault"
     time = float((step + share) * dt)
     return Contact(body, time, kind, speed, closing, other, depth, _seen(run, body, step))

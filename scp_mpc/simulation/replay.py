@@ -21,6 +21,7 @@ from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
 from scp_mpc.simulation.run import Run
 from scp_mpc.simulation.scene import Body, Scene
+from scp_mpc.simulation.sensor import nearest_first
 from scp_mpc.simulation.simulate import simulate
 from scp_mpc.simulation.there_and_back import ThereAndBack
 from scp_mpc.tracking.tracker import Tracker, TrackerSettings
@@ -91,8 +92,7 @@ class RecordedSensor:
             names = self._recording.names[self._frame].tolist()
             self._tracker.update(self._times[self._frame], measured, names)
             self._frame += 1
-        told, here = self._tracker.predictions(time), x[self._problem.model.position]
-        told.sort(key=lambda o: float(np.linalg.norm(o.means[0] - here)))
+        told = nearest_first(self._tracker.predictions(time), x[self._problem.model.position])
         return x, told[: self._problem.max_obstacles]
 
 
@@ -101,10 +101,8 @@ def replay_problem(
 ) -> Problem:
     """A robot of 0.3 m at a walking pace, 95 % containment at each sample.
 
-    The default horizon is 3 s: over a recorded street, plans of 2 s touched more people and took
-    longer to the goal, those of 6 s took several times as long to compute and were no quicker. No
-    horizon froze the robot: predictions grow to a standard deviation of 0.6 m at 3 s and 1.1 m at
-    4.8 s, but what closes the way that late is seen to be open long before the robot is there.
+    The default horizon is 3 s, at which predictions of people have grown to a standard deviation of
+    some 0.6 m.
     """
     return Problem(
         DoubleIntegrator(DT),

@@ -62,8 +62,6 @@ class TrackedSensor:
         miss: Chance that somebody is missed in one scan.
         outage_rate: Outages of the whole sensor per second.
         outage_time: How long each of them lasts [s].
-        reach: Up to where from the robot bodies are seen [m].
-        names: Whether measurements come with names; without, the tracker associates them.
         tracking: Of the tracker.
 
     Raises:
@@ -78,8 +76,6 @@ class TrackedSensor:
         miss: float = 0.0,
         outage_rate: float = 0.0,
         outage_time: float = 1.0,
-        reach: float = np.inf,
-        names: bool = True,
         tracking: TrackerSettings | None = None,
     ) -> None:
         """Check the numbers."""
@@ -90,8 +86,7 @@ class TrackedSensor:
         if as_number("outage_rate", outage_rate) < 0:
             raise BoundsError("outage_rate", f"{outage_rate} is negative")
         self._noise, self._state_std, self._miss = noise, state_std, miss
-        self._outage_rate, self._outage_time, self._reach = outage_rate, outage_time, reach
-        self._names = names
+        self._outage_rate, self._outage_time = outage_rate, outage_time
         self._tracking = TrackerSettings(confirmations=1) if tracking is None else tracking
 
     def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
@@ -121,16 +116,17 @@ class TrackedSensor:
             return y, self._walls
         who = np.flatnonzero(self._moving)
         where = positions[who]
-        seen = np.linalg.norm(where - here, axis=1) <= self._reach  # False for NaN
-        seen &= rng.random(len(who)) >= self._miss
+        seen = ~np.isnan(where[:, 0]) & (rng.random(len(who)) >= self._miss)
         measured = where + self._noise * rng.standard_normal(where.shape)
         if time >= self._blind_until:
             if rng.random() < self._outage_rate * self._problem.model.dt:
                 self._blind_until = time + self._outage_time
             else:
-                names = who[seen].tolist() if self._names else None
-                self._tracker.update(time, measured[seen], names)
-        told = self._tracker.predictions(time)
-        told.sort(key=lambda o: float(np.linalg.norm(o.means[0] - here) - o.radius))
-        room = max(self._problem.max_obstacles - len(self._walls), 0)
-        return y, [*self._walls, *told[:room]]
+                self._tracker.update(time, measured[seen], who[seen].tolist())
+        told = nearest_first(self._tracker.predictions(time), here)
+        return y, [*self._walls, *told][: self._problem.max_obstacles]
+
+
+def nearest_first(told: list[ObstaclePrediction], here: FloatArray) -> list[ObstaclePrediction]:
+    """Return predictions in order of their distance now from a place (d,)."""
+    return sorted(told, key=lambda o: float(np.linalg.norm(o.means[0] - here) - o.radius))
