@@ -154,9 +154,8 @@ class Fallback:
         slack = np.zeros((problem.max_obstacles, step.nodes.size))
         slack[: step.count] = step.depths(step.nodes.positions(states, inputs), s)
         outside = problem.row_excess(states).max(initial=0.0)
-        most = (
-            np.inf if lost.any() else float(np.maximum(slack.max(initial=0.0), outside))
-        )  # or NaN
+        most = float(np.maximum(slack.max(initial=0.0), outside))  # or NaN
+        most = np.inf if lost.any() else most
         if status.ok and not most <= self._tolerance:
             status = Status.FALLBACK
         cost = problem.cost(states, inputs, s, step.x_ref)

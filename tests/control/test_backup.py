@@ -137,3 +137,19 @@ def _keeps_its_promise(seed, moving):
     assert row["first_ok"] is not None, seed
     assert not row["not_ok"], seed
     assert row["contact"] is None, seed
+
+
+@pytest.mark.parametrize("limit", ["wall", "wall and speed"])
+@pytest.mark.parametrize("model", [DoubleIntegrator(0.1), Unicycle(0.1)], ids=["point", "car"])
+def test_a_robot_stops_at_the_end_of_its_room(model, limit):
+    """Its horizon is shorter than what braking takes, and nothing else is there."""
+    speed = 1.5 if limit != "wall" else None
+    room = {"x_max": [3.0, np.inf, np.inf, np.inf], "speed_max": speed}
+    problem = Problem(model, horizon=8, **{**KNOWN, **room})
+    mpc, x = MPC(problem), np.zeros(4)
+    for _ in range(60):
+        plan = mpc.step(x, model.state(np.array([9.0, 0.0]), np.zeros(2)))
+        assert plan.ok
+        x = model.step(x, plan.u0)
+        assert x[0] <= 3.0 + 1e-6
+    assert x[0] > 2.9

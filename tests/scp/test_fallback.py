@@ -23,6 +23,7 @@ from scp_mpc import (
     Unicycle,
 )
 from scp_mpc.deadline import Clock, Pace
+from scp_mpc.models import FunctionModel
 from scp_mpc.qp.backend import ProgramSolver
 
 
@@ -322,3 +323,17 @@ def test_no_status_says_that_braking_is_in_time_when_it_is_not():
     plan = SCP(this).solve(fast, straight_reference(N, 3.0), wall)
     assert plan.status is Status.FALLBACK
     np.testing.assert_allclose(plan.u0, [-3.0, 0.0])
+
+
+def test_inputs_that_lead_where_the_model_ends_are_no_plan():
+    """Beyond a metre it has no next state: nothing is known to be passively safe there."""
+
+    def shift(x, u):
+        return np.where(np.abs(x) > 1.0, np.nan, x + 0.2 * u)
+
+    robot = FunctionModel(shift, nx=2, nu=2, dt=0.2, position=[0, 1], discrete=True)
+    this = Problem(robot, horizon=8, Q=[1, 1], R=[1, 1], u_min=-2.0, u_max=2.0)
+    away = SCP(this).follow(np.zeros(2), np.zeros(2), [], np.full((8, 2), 1.5))
+    assert away.status is Status.FALLBACK
+    assert away.kkt.feasibility == np.inf
+    assert np.isfinite(away.X).all()

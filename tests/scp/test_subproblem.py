@@ -327,3 +327,15 @@ def test_blocks_keep_zeros_in_the_pattern():
     assert matrix.nnz == 4
     matrix.data[places["values"]] = [1.0, 2.0, 3.0, 4.0]
     np.testing.assert_array_equal(matrix.toarray(), [[4, 2], [0, 3], [1, 0]])
+
+
+@pytest.mark.parametrize("case", ["plane", "unicycle"])
+def test_an_elastic_program_holds_a_crowd(case):
+    """With fewer half-spaces at each node than it takes, programs with slack are not solved."""
+    this, x0, x_ref, _ = CASES[case]()
+    this, rng = replace(this, max_obstacles=6), np.random.default_rng(4)
+    crowd = [ObstaclePrediction.static(N, 0.4 * rng.normal(size=2), 0.2) for _ in range(6)]
+    plan = about(this, x0)
+    program = SCP(this).subproblem(x0, x_ref, crowd, guess=plan, elastic=True)
+    couplings = couplings_of(program, this)
+    equal(program, rebuilt(this, x0, x_ref, crowd, plan.inputs, True, None, couplings))
