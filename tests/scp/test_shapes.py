@@ -113,7 +113,11 @@ def test_others_are_as_without_polytopes_beside_them(inflation, seed, dim):
 @some
 @given(seed=seeds)
 def test_who_is_near_is_found(seed):
-    """`within` leaves out nobody whose no-go set is nearer than the distance."""
+    """`within` leaves out nobody whose no-go set is nearer, and takes in whom its bound says.
+
+    The bound is the distance along the line to an ellipsoid's middle, and of a polytope its own,
+    less the largest standard deviation in any direction.
+    """
     rng, predictions, _, _, _, _ = scene(seed)
     case = problem(N, max_obstacles=4)
     step = Step.read(case, np.zeros(4), np.zeros(4), predictions, 0.01 * np.eye(2))
@@ -125,7 +129,15 @@ def test_who_is_near_is_found(seed):
         before = path[None, :-1] - step.means[:, :-1]
         g = case.no_go.linearise(NoGoSets.stacked(*given), path[1:], s[:3], before).value
         assert near[g <= gap - 1e-12].all()
-        assert not near[g > gap + 3.0].any()
+        for j, i in np.ndindex(near.shape):
+            y, Sigma = path[i + 1] - step.means[j, i + 1], step.covariances[j, i + 1]
+            away, width = np.linalg.norm(y), step.largest_stds[j, i + 1]
+            if j == 1:  # the ellipsoid
+                width = np.sqrt(y @ Sigma @ y) / away
+            else:
+                away = distance(predictions[j].shape.vertices, y)
+            room = away - s[j] * width - step.radii[j, i] - gap
+            assert abs(room) < 1e-6 or near[j, i] == (room < 0)
     known = rng.random((3, N)) < 0.5
     unknown = step.within(path, s, 0.5, known)
     assert unknown is None or not (unknown & known).any()
