@@ -19,6 +19,46 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 _LARGEST = 1e15
+_SAME_INTERVAL = 1e-6  # relative difference of intervals that is none
+
+
+class SampledArray(np.ndarray[Any, np.dtype[np.float64]]):
+    """An array (n, ...) that knows how far its rows are apart: `dt` seconds; None for unknown.
+
+    Arithmetic and copies keep it, views of some of the rows do not.
+    """
+
+    dt: float | None
+
+    @classmethod
+    def of(cls, array: FloatArray, dt: float) -> "SampledArray":
+        """The same data, with its interval."""
+        sampled = array.view(cls)
+        sampled.dt = float(dt)
+        return sampled
+
+    def __array_finalize__(self, obj: object) -> None:
+        """Take over the interval where the shape is the same."""
+        same = isinstance(obj, SampledArray) and obj.shape == self.shape
+        self.dt = getattr(obj, "dt", None) if same else None
+
+
+def require_sampled(argument: str, x: ArrayLike, wanted: float) -> None:
+    """Raise unless rows that know their interval have the `wanted` one [s]: `require_interval`."""
+    if isinstance(x, SampledArray):
+        require_interval(argument, x.dt, wanted, "make it with the robot's dt")
+
+
+def require_interval(argument: str, dt: float | None, wanted: float, remedy: str) -> None:
+    """Raise unless an interval `dt` [s] is the `wanted` one; None, unknown, is believed to be.
+
+    Raises:
+        InvalidArgumentError: With both numbers and the remedy.
+    """
+    if dt is not None and abs(dt - wanted) > _SAME_INTERVAL * wanted:
+        raise InvalidArgumentError(
+            argument, f"rows are {dt:g} s apart, the robot's intervals {wanted:g} s: {remedy}"
+        )
 
 
 def as_array(argument: str, value: ArrayLike, *shapes: tuple[int, ...]) -> FloatArray:

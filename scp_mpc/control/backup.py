@@ -21,7 +21,6 @@ import numpy as np
 
 from scp_mpc.arrays import FloatArray
 from scp_mpc.obstacles.prediction import ObstaclePrediction
-from scp_mpc.obstacles.propagation import positive_part
 from scp_mpc.problem import Problem
 from scp_mpc.scp.braking import AT_REST, braking
 from scp_mpc.scp.fallback import Fallback
@@ -197,12 +196,8 @@ class Backup:
 
     def _later(self, obstacle: ObstaclePrediction, stage: int) -> ObstaclePrediction:
         """A prediction from a stage on, carried on beyond its last row."""
-        means, Sigma, N = obstacle.means, obstacle.covariances, obstacle.horizon
-        row = stage + np.arange(self._problem.horizon + 1)
-        inside, beyond = np.minimum(row, N), np.maximum(row - N, 0)
-        mu = means[inside] + beyond[:, None] * (means[N] - means[N - 1])
-        growth = positive_part(Sigma[N] - Sigma[N - 1])
-        return obstacle.with_rows(mu, Sigma[inside] + beyond[:, None, None] * growth, None)
+        rows = stage + np.arange(self._problem.horizon + 1)
+        return obstacle.with_rows(*obstacle.interpolated(rows), None)
 
 
 def _size(obstacle: ObstaclePrediction) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray, as_array, as_count, as_number
+from scp_mpc.arrays import SampledArray, as_array, as_count, as_number
 from scp_mpc.control.path import Path
 from scp_mpc.control.speed import Schedule, SpeedLimits
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
@@ -92,8 +92,8 @@ class PathReference:
         """Forget the progress: the next call looks at all of the path."""
         self._progress: float | None = None
 
-    def states(self, x0: ArrayLike) -> FloatArray:
-        """Reference states (N+1, nx) for a robot in state x0 (nx,), and its progress.
+    def states(self, x0: ArrayLike) -> SampledArray:
+        """Reference states (N+1, nx) for a robot in state x0 (nx,), which know their interval.
 
         Raises:
             InvalidArgumentError: Or a subclass: not a state. Progress is then as before.
@@ -107,9 +107,9 @@ class PathReference:
         heading = getattr(model, "heading", None)
         if heading is not None:
             v = np.maximum(v, _CREEP)
-        x_ref: FloatArray = model.state(position, v[:, None] * tangent)
+        x_ref = model.state(position, v[:, None] * tangent)
         if heading is not None:
             turns = np.round((x[heading] - x_ref[0, heading]) / (2 * np.pi))
             x_ref[:, heading] += 2 * np.pi * turns
         self._progress = s
-        return x_ref
+        return SampledArray.of(x_ref, model.dt)

@@ -14,7 +14,7 @@ Notation:
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray, as_array, as_count
+from scp_mpc.arrays import FloatArray, as_array, as_count, require_sampled
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.models.linear import LinearModel
 from scp_mpc.models.riccati import lqr_preview
@@ -60,6 +60,7 @@ class Preview:
             NotFiniteError: NaN or infinity.
         """
         N, A = self._problem.horizon, self._A
+        require_sampled("x_ref", x_ref, self._problem.model.dt)
         rows = as_array("x_ref", x_ref, (N + 1 + self._rows, len(A)))
         w = rows[N:-1] @ A.T - rows[N + 1 :]
         folded = rows[: N + 1].copy()

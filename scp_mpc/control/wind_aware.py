@@ -12,7 +12,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray, as_array, frozen
+from scp_mpc.arrays import FloatArray, as_array, frozen, require_sampled
 from scp_mpc.control.estimator import DisturbanceEstimator, Estimate
 from scp_mpc.control.mpc import MPC
 from scp_mpc.control.position_covariance import PositionCovariance, Prediction
@@ -159,6 +159,7 @@ class WindAwareMPC:
     ) -> Plan:
         model, problem = self._estimator.model, self._problem
         N, nx, d = problem.horizon, problem.model.nx, model.dim
+        require_sampled("x_ref", x_ref, model.dt)
         x_ref = as_array("x_ref", x_ref, (N + 1, nx), (nx,))
         given = None
         if robot_covariance is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from scp_mpc.arrays import (
     as_count,
     as_number,
     frozen,
+    require_interval,
     require_positive_semidefinite,
 )
 from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
@@ -26,6 +28,8 @@ class ObstaclePrediction:
 
     Row 0 is now, or at `stamp` where that is given; the controller constrains rows 1 .. N.
     `dataclasses.replace(prediction, stamp=..., name=...)` adds what a predictor does not know.
+    Rows are `dt` seconds apart. A robot with another interval refuses them, see `resampled`; where
+    `dt` is None, as by default for arrays made by hand, they are believed to be at the robot's.
 
     Args:
         means: (N+1, d) expected positions [m].
@@ -35,6 +39,7 @@ class ObstaclePrediction:
         name: Who it is, the same at every step, for example a tracker's number; None for nobody.
         shape: A `Polytope`; None for a ball. Of a polytope's covariances the largest standard
             deviation counts, in all directions; zero covariances make it a wall.
+        dt: Interval between rows [s]; None for the robot's.
 
     Attributes:
         largest_std: (N+1,) largest standard deviation in any direction [m].
@@ -44,7 +49,7 @@ class ObstaclePrediction:
         ShapeError: The shapes do not belong together.
         NotFiniteError: NaN or infinity.
         CovarianceError: A covariance is not symmetric positive semi-definite.
-        BoundsError: The radius is negative.
+        BoundsError: The radius is negative, or dt not positive.
     """
 
     means: FloatArray
@@ -53,6 +58,7 @@ class ObstaclePrediction:
     stamp: float | None
     name: Hashable
     shape: Solid | None
+    dt: float | None
     largest_std: FloatArray = field(init=False)
 
     def __init__(
@@ -63,6 +69,7 @@ class ObstaclePrediction:
         stamp: float | None = None,
         name: Hashable = None,
         shape: Solid | None = None,
+        dt: float | None = None,
     ) -> None:
         """Copy, check and freeze."""
         mu = as_array("means", means, (-1, 2), (-1, 3))
@@ -82,7 +89,11 @@ class ObstaclePrediction:
             _require_hashable(name)
         if shape is not None:
             _require_solid(shape, dim)
-        self._set(mu, Sigma, radius, stamp, name, shape, _deviations(variances))
+        if dt is not None:
+            dt = as_number("dt", dt)
+            if dt <= 0:
+                raise BoundsError("dt", f"{dt} s is not positive")
+        self._set(mu, Sigma, radius, stamp, name, shape, dt, _deviations(variances))
 
     @classmethod
     def static(
@@ -115,7 +126,45 @@ class ObstaclePrediction:
         """Return the same obstacle elsewhere, unchecked: for what follows from checked arrays."""
         other = object.__new__(ObstaclePrediction)
         largest_std = _deviations(np.linalg.eigvalsh(covariances))
-        other._set(means, covariances, self.radius, stamp, self.name, self.shape, largest_std)
+        kept = self.radius, stamp, self.name, self.shape, self.dt
+        other._set(means, covariances, *kept, largest_std)
+        return other
+
+    def interpolated(self, rows: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Return means (n, d) and covariances (n, d, d) at rows (n,), which need not be whole.
+
+        Both are linear between two rows. Beyond the last one the mean goes on at the last
+        interval's velocity, and the covariance goes on growing in the directions in which it grew
+        last, never shrinking. Before the first one the mean goes back, and nothing is surer.
+        """
+        mu, Sigma, N = self.means, self.covariances, self.horizon
+        k = np.clip(np.floor(rows), 0, N).astype(np.intp)
+        f, after = (rows - k)[:, None], np.minimum(k + 1, N)
+        last = np.minimum(k, N - 1)
+        means = mu[k] + f * (mu[last + 1] - mu[last])
+        covariances = Sigma[k] + np.maximum(f, 0.0)[..., None] * (Sigma[after] - Sigma[k])
+        beyond = np.maximum(rows - N, 0.0)[:, None, None]
+        if beyond.any():
+            covariances += beyond * positive_part(Sigma[N] - Sigma[N - 1])
+        return means, covariances
+
+    def resampled(self, dt: float, horizon: int) -> "ObstaclePrediction":
+        """Return the same prediction for a robot with another interval, see `interpolated`.
+
+        Args:
+            dt: Between the rows of the result [s].
+            horizon: N of the result; it may look farther ahead than this prediction.
+
+        Raises:
+            InvalidArgumentError: Or a subclass: this prediction's own interval is not known.
+        """
+        if self.dt is None:
+            raise InvalidArgumentError("dt", "not known: replace(prediction, dt=...)")
+        if as_number("dt", dt) <= 0:
+            raise BoundsError("dt", f"{dt} s is not positive")
+        rows = np.arange(as_count("horizon", horizon) + 1) * (dt / self.dt)
+        other = self.with_rows(*self.interpolated(rows), self.stamp)
+        object.__setattr__(other, "dt", float(dt))
         return other
 
     def _set(
@@ -126,6 +175,7 @@ class ObstaclePrediction:
         stamp: float | None,
         name: Hashable,
         shape: Solid | None,
+        dt: float | None,
         largest_std: FloatArray,
     ) -> None:
         object.__setattr__(self, "means", frozen(means))
@@ -134,6 +184,7 @@ class ObstaclePrediction:
         object.__setattr__(self, "stamp", stamp)
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "dt", dt)
         object.__setattr__(self, "largest_std", frozen(largest_std))
 
     @property
@@ -150,6 +201,15 @@ class ObstaclePrediction:
 def _deviations(variances: NDArray[np.floating]) -> FloatArray:
     """Roots (...) of the largest eigenvalues of covariances, given all (..., d), ascending."""
     return np.sqrt(np.maximum(variances[..., -1], 0.0))
+
+
+def positive_part(matrix: FloatArray) -> FloatArray:
+    """The nearest positive semi-definite matrix to a symmetric one: itself if it is one."""
+    values, vectors = np.linalg.eigh(matrix)
+    if values[0] >= 0:
+        return matrix
+    part: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return (part + part.T) / 2
 
 
 def _require_hashable(name: object) -> None:
@@ -172,6 +232,7 @@ def unchecked_predictions(
     radius: float,
     stamp: float,
     names: Sequence[Hashable],
+    dt: float,
 ) -> list[ObstaclePrediction]:
     """Return many predictions at once, unchecked: for what a tracker has made of checked arrays.
 
@@ -181,12 +242,13 @@ def unchecked_predictions(
         radius: Of each [m].
         stamp: Time of row 0 [s].
         names: n of them.
+        dt: Interval between rows [s].
     """
     largest_stds = _deviations(np.linalg.eigvalsh(covariances))
     made = []
     for mu, Sigma, largest_std, name in zip(means, covariances, largest_stds, names, strict=True):
         made.append(object.__new__(ObstaclePrediction))
-        made[-1]._set(mu, Sigma, radius, stamp, name, None, largest_std)
+        made[-1]._set(mu, Sigma, radius, stamp, name, None, dt, largest_std)
     return made
 
 
@@ -205,3 +267,23 @@ def as_predictions(obstacles: object) -> tuple[ObstaclePrediction, ...]:
                 f"obstacles[{j}]", f"{obstacle!r} is not an ObstaclePrediction"
             )
     return given
+
+
+def require_fitting(
+    obstacles: Sequence[ObstaclePrediction], horizon: int, dim: int, dt: float
+) -> None:
+    """Check that predictions are over a robot's horizon N, in its workspace and at its interval.
+
+    Raises:
+        ShapeError: Other rows or another dimension.
+        InvalidArgumentError: Another interval.
+    """
+    for j, obstacle in enumerate(obstacles):
+        if obstacle.means.shape != (horizon + 1, dim):
+            raise ShapeError(
+                f"obstacles[{j}].means",
+                f"shape {obstacle.means.shape} is not {(horizon + 1, dim)}",
+            )
+        if obstacle.dt is not None and obstacle.dt != dt:
+            remedy = f"prediction.resampled({dt:g}, {horizon})"
+            require_interval(f"obstacles[{j}].dt", obstacle.dt, dt, remedy)

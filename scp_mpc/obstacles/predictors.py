@@ -63,6 +63,7 @@ class ReportPredictor:
                 self.position_covariance, dt**2 / 4 * (Sigma_v[1:] + Sigma_v[:-1])
             ),
             radius=radius,
+            dt=dt,
         )
 
 
@@ -88,6 +89,7 @@ class ConstantVelocityPredictor:
             means=np.asarray(position) + t[:, None] * np.asarray(velocity),
             covariances=self.position_covariance + (t**2)[:, None, None] * self.velocity_covariance,
             radius=radius,
+            dt=dt,
         )
 
 

@@ -14,13 +14,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import BoolArray, FloatArray, IntArray, as_array, require_positive_semidefinite
-from scp_mpc.errors import ShapeError, TooManyObstaclesError
+from scp_mpc.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_array,
+    require_positive_semidefinite,
+    require_sampled,
+)
+from scp_mpc.errors import TooManyObstaclesError
 from scp_mpc.geometry.margin import Margin
 from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.geometry.polytopes import Polytopes
 from scp_mpc.geometry.risk import risk_bound
-from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
+from scp_mpc.models.model import Model
+from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions, require_fitting
 from scp_mpc.problem import Problem
 from scp_mpc.scp.braking import braking
 from scp_mpc.scp.nodes import Nodes
@@ -81,18 +89,11 @@ class Step:
         """
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
         state = as_array("x0", x0, (model.nx,))
-        reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
-        if reference.ndim == 1:
-            reference = np.tile(reference, (N + 1, 1))
+        reference = as_reference(x_ref, N, model, state)
         obstacles = as_predictions(obstacles)
         if len(obstacles) > M:
             raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = {M}")
-        for j, obstacle in enumerate(obstacles):
-            if obstacle.means.shape != (N + 1, model.dim):
-                raise ShapeError(
-                    f"obstacles[{j}].means",
-                    f"shape {obstacle.means.shape} is not {(N + 1, model.dim)}",
-                )
+        require_fitting(obstacles, N, model.dim, model.dt)
         uncertain = None
         if robot_covariance is not None:
             shape = (model.dim, model.dim)
@@ -346,6 +347,27 @@ class Step:
         Sigma = plain._covariances(None)[:, 1:]  # a risk is that of the whole prediction
         given = plain.means[:, 1:], Sigma, self.radii, self.count, self.shapes
         return risk_bound(NoGoSets.stacked(*given), path)
+
+
+def as_reference(x_ref: ArrayLike, horizon: int, model: Model, x0: FloatArray) -> FloatArray:
+    """Return the reference (N+1, nx) of a robot in state x0 (nx,), held where it is one state.
+
+    Headings are angles: they are unwrapped, row by row, from that of the state, so that the plan
+    never turns the long way round.
+
+    Raises:
+        InvalidArgumentError: Or one of its subclasses.
+    """
+    require_sampled("x_ref", x_ref, model.dt)
+    reference = as_array("x_ref", x_ref, (horizon + 1, model.nx), (model.nx,))
+    if reference.ndim == 1:
+        reference = np.tile(reference, (horizon + 1, 1))
+    if model.heading is not None:
+        heading = reference[:, model.heading]
+        turns = np.rint(np.diff(heading, prepend=x0[model.heading]) / (2 * np.pi))
+        if turns.any():
+            heading -= 2 * np.pi * np.cumsum(turns)
+    return reference
 
 
 def _squared(vectors: FloatArray) -> FloatArray:

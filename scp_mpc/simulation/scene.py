@@ -9,6 +9,7 @@ Notation:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -61,7 +62,8 @@ class Body:
         Sigma = self.covariances
         if Sigma is None:
             Sigma = np.zeros((means.shape[1], means.shape[1]))
-        return ObstaclePrediction(means, Sigma, self.radius, name=self.name, shape=self.shape)
+        more: dict[str, Any] = {"name": self.name, "shape": self.shape, "dt": dt}
+        return ObstaclePrediction(means, Sigma, self.radius, **more)
 
 
 class Scene:
@@ -97,7 +99,7 @@ class Scene:
     def x_ref(self, time: float, x: FloatArray) -> FloatArray:
         """Reference (nx,) or (N+1, nx) for a robot in state x (nx,) at a time."""
         if callable(self._reference):
-            return np.asarray(self._reference(time, x), dtype=np.float64)
+            return np.asanyarray(self._reference(time, x), dtype=np.float64)
         return self._reference
 
     def predictions(self, time: float, dt: float, horizon: int) -> list[ObstaclePrediction]:

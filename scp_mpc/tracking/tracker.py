@@ -173,10 +173,10 @@ class Tracker:
         if not isinstance(self.settings, TrackerSettings):
             raise InvalidArgumentError("settings", f"{settings!r} is not a TrackerSettings")
         self._noise = float(measurement_std) ** 2 * np.eye(dim)
-        self._radius, self._dim = float(radius), dim
+        self._dt, self._radius, self._dim = float(dt), float(radius), dim
         self._gate = self.settings.gate_at(dim)
         self._bank = MotionBank(self.settings.motions, self.settings.dwell_time, dim)
-        self._prediction = HorizonPredictor(self._bank, as_count("horizon", horizon), float(dt))
+        self._prediction = HorizonPredictor(self._bank, as_count("horizon", horizon), self._dt)
         self.reset()
 
     def reset(self) -> None:
@@ -267,7 +267,7 @@ class Tracker:
         tracks = tracks.at(np.flatnonzero(tracks.hits >= self.settings.confirmations))
         means, Sigma = self._prediction.positions(tracks.beliefs)
         Sigma *= self.settings.std_inflation**2
-        return unchecked_predictions(means, Sigma, self._radius, now, tracks.names)
+        return unchecked_predictions(means, Sigma, self._radius, now, tracks.names, self._dt)
 
     def _later(self, time: float) -> float:
         now = as_number("time", time)
