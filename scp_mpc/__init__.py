@@ -11,6 +11,7 @@ from scp_mpc.control import (
     Preview,
     SpeedLimits,
     WindAwareMPC,
+    shortest_path,
 )
 from scp_mpc.errors import (
     BoundsError,
@@ -106,4 +107,5 @@ __all__ = [
     "WindAwareMPC",
     "__version__",
     "lqr_weight",
+    "shortest_path",
 ]

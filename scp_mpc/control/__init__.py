@@ -10,6 +10,7 @@ from scp_mpc.control.path_reference import PathReference
 from scp_mpc.control.preview import Preview
 from scp_mpc.control.reference import CircularReference
 from scp_mpc.control.regulator import Regulator
+from scp_mpc.control.shortest_path import shortest_path
 from scp_mpc.control.speed import (
     Schedule,
     SpeedLimits,
@@ -32,4 +33,5 @@ __all__ = [
     "SpeedLimits",
     "WindAwareMPC",
     "disturbed",
+    "shortest_path",
 ]
