@@ -57,7 +57,7 @@ def main(
     count = RUNS[kind] if runs is None else runs
     rows = in_one_thread(_rows, kind, recordings or [], count, out, jobs)
     found = [
-        {"group": group, **summed(some), **_progress(some), "moving": moving(some)}
+        {"group": group, **summed(some), **progress_of(some), "moving": moving(some)}
         for group, some in rows.items()
     ]
     write(out, f"crowds-{kind}", markdown(kind, found), {"rows": found}, echo=echo)
@@ -91,7 +91,7 @@ def _episodes(kind: str, recordings: list[Path]) -> Iterator[tuple[Group, Episod
                     yield (robot, str(count), variant), one
 
 
-def _progress(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def progress_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """How far the robots got."""
     if "passes" in rows[0]:
         passes = [seconds for row in rows for seconds in row["passes"]]

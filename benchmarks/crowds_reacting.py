@@ -91,7 +91,7 @@ class Square(Scene):
             apart = all(np.linalg.norm(place - other) > 3 * RADIUS for other in places)
             if apart and np.linalg.norm(place - START) > 5 * RADIUS:
                 places.append(place)
-        return np.array(places)
+        return np.array(places).reshape(-1, 2)
 
     def advance(self, time: float, x: FloatArray) -> FloatArray:  # noqa: ARG002
         """See `Scene`; people decide on what they saw when the interval began."""
@@ -131,7 +131,7 @@ class Square(Scene):
             self._orca.set_agent_pref_velocity(who, wanted[who])
         self._orca.do_step()
         new = (self._orca.get_agent_velocity(who + 1) for who in range(self._count))
-        return np.array([(v.x, v.y) for v in new])
+        return np.array([(v.x, v.y) for v in new]).reshape(-1, 2)
 
 
 def _angles(vectors: FloatArray) -> FloatArray:
