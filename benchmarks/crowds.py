@@ -48,7 +48,7 @@ def main(
 
     Args:
         kind: "dense", "recorded" or "reacting".
-        out: Folder for crowds-kind.md and .json, and one .jsonl for each group of runs.
+        out: Folder for crowds_kind.md and .json, and one .jsonl for each group of runs.
         recordings: Files for the first two.
         runs: How many of each group; their seeds are 0, 1, ...
         jobs: Processes.
@@ -60,7 +60,7 @@ def main(
         {"group": group, **summed(some), **progress_of(some), "moving": moving(some)}
         for group, some in rows.items()
     ]
-    write(out, f"crowds-{kind}", markdown(kind, found), {"rows": found}, echo=echo)
+    write(out, f"crowds_{kind}", markdown(kind, found), {"rows": found}, echo=echo)
 
 
 def _rows(
