@@ -1,8 +1,13 @@
 """A robot given by functions: anybody's own dynamics.
 
+Differences of a next state x_{i+1} = g(x, u) far from the origin of its coordinates would be
+differences of large, rounded numbers. Where g(x, u) - x is the same with the position at zero, as
+that of nearly every robot is, they are taken there; this is looked at for each point anew.
+
 Notation:
     g(x, u)     the function: x' [1/s] where continuous, else the next state
     J (nx, n)   its derivatives [dg/dx, dg/du], n = nx + nu
+    z (n,)      (x, u)
 """
 
 from collections.abc import Callable
@@ -13,33 +18,36 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_count, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
+from scp_mpc.models.batched import Batched, Layout
 from scp_mpc.models.coasting import coasting_state, coasting_stop
+from scp_mpc.models.differences import differences, second_differences
 from scp_mpc.models.model import (
     Linearisation,
-    Model,
     as_period,
     as_places,
     as_velocity,
-    differences,
     joined,
+    require_agreement,
 )
 from scp_mpc.models.runge_kutta import ContinuousModel
 
 Function = Callable[[FloatArray, FloatArray], Any]
 _COMPLEX_STEP = 1e-30
+_SAME = 8.0  # roundings by which g(x, u) - x may differ where the position makes no difference
 
 
 class FunctionModel(ContinuousModel):
     """x' = g(x, u) by Runge-Kutta steps, or x_{i+1} = g(x_i, u_i) where `discrete`.
 
-    Within an interval a discrete model moves in a straight line between both ends.
+    Within an interval a discrete model moves in a straight line between both ends. Second
+    derivatives are differences of g, right to about seven digits.
 
     Args:
-        function: g, from (nx,) and (nu,) to (nx,), or batched if `vectorised`.
+        function: g, from (nx,) and (nu,) to (nx,).
         jacobians: Returns the pair dg/dx (nx, nx), dg/du (nx, nu). Or "central": differences of g,
             right to about ten digits. Or "complex": derivatives to rounding errors from a complex
             step, for a g that is analytic in numpy (no abs, no arctan2, no comparisons); this one
-            is always checked. The curvature from "central" is right to about five digits.
+            is always checked.
         nx: Number of states.
         nu: Number of inputs.
         dt: Sampling time [s].
@@ -48,19 +56,24 @@ class FunctionModel(ContinuousModel):
         heading: Index of the heading within the state, for a planar robot that has one.
         velocity: Indices of the velocity within the state, see `Model`; None where it holds none.
         equilibrium_input: Input (nu,) to start plans from; zeros if None.
-        vectorised: Both functions take (..., nx) and (..., nu); otherwise they are looped over.
+        vectorised: True: both functions take (..., nx) and (..., nu). False: they are called for
+            one point at a time. None: each is tried with many random points at once, as rows
+            (K, nx) or as columns (nx, K), and called so if that gives what single points give.
         substeps: Runge-Kutta steps per interval.
         stopping_input: x (nx,) to the input (nu,) that stops it; if None, least squares over an
             interval.
         state: Positions and velocities (..., d) to states (..., nx); if None, least squares.
-        check: Compare the Jacobians with differences of g: True at zero and `equilibrium_input`, or
-            at given points (states (..., nx), inputs (..., nu)). The shapes are always checked.
+        check: Compare the Jacobians with differences of g: True at 24 random states and inputs
+            about zero and `equilibrium_input`, see `Model.check`; or about a given state (nx,) and
+            input (nu,), say at the origin of a map; or at given points (..., nx), (..., nu) and no
+            others. The shapes are always checked.
 
     Raises:
         ShapeError: A function returns another shape than announced.
-        NotFiniteError: A function returns NaN or infinity at the checked points.
+        NotFiniteError: A function returns NaN or infinity at zero, or at the points given.
         JacobianError: Jacobians that are not g's, where `check` asks for it.
-        InvalidArgumentError: Another argument cannot be meant.
+        InvalidArgumentError: Another argument cannot be meant; a function raises at zero; or no
+            input changes anything, as where x and u are in the wrong order.
     """
 
     def __init__(
@@ -76,7 +89,7 @@ class FunctionModel(ContinuousModel):
         heading: int | None = None,
         velocity: ArrayLike | None = None,
         equilibrium_input: ArrayLike | None = None,
-        vectorised: bool = False,
+        vectorised: bool | None = None,
         substeps: int = 1,
         stopping_input: Callable[[FloatArray], FloatArray] | None = None,
         state: Function | None = None,
@@ -97,6 +110,8 @@ class FunctionModel(ContinuousModel):
         ):
             if not callable(given) and (given is not None or name == "function"):
                 raise InvalidArgumentError(name, f"{given!r} is not a function")
+        if type(function).__module__.split(".")[0] == "casadi":
+            raise InvalidArgumentError("function", "is one of CasADi: CasadiModel takes it")
         self.heading, self.discrete = heading, bool(discrete)
         self.velocity = as_velocity(velocity, self._nx, len(self.position))
         self.equilibrium_input = frozen(
@@ -106,16 +121,27 @@ class FunctionModel(ContinuousModel):
                 (nu,),
             )
         )
-        self._function, self._jacobians, self._vectorised = function, jacobians, vectorised
         self._stop, self._state = stopping_input, state
         points = check if isinstance(check, tuple) else (np.zeros(self._nx), self.equilibrium_input)
         x, u = as_array("check", points[0]), as_array("check", points[1])
         if x.shape[-1:] != (self._nx,) or u.shape[-1:] != (self._nu,):
             raise ShapeError("check", f"shapes {x.shape}, {u.shape} are not (..., nx), (..., nu)")
+        x0, u0 = (part.reshape(-1, part.shape[-1])[0] for part in (x, u))
+        trial = self._random_points(x0, u0, _trials(nx, nu))
+        layout: Layout | None = None if vectorised is None else "any" if vectorised else "single"
+        self._function = Batched("function", function, (nx,), layout, (x0, u0), trial)
         as_array("function", self.derivative(x, u))
+        self._require_inputs(*trial)
+        self._movable = self.discrete and self._stands_at_zero(joined(x0, u0))
+        self._jacobians: Batched | Literal["central", "complex"] = "central"
+        if callable(jacobians):
+            shape = (nx, nx + nu)
+            self._jacobians = Batched("jacobians", jacobians, shape, layout, (x0, u0), trial)
+        else:
+            self._jacobians = jacobians
         as_array("jacobians", self.jacobians(x, u))
         if check is not False or jacobians == "complex":
-            self.check(x, u)
+            self.check(*(points if isinstance(check, tuple) else ()))
 
     @property
     def nx(self) -> int:
@@ -129,25 +155,29 @@ class FunctionModel(ContinuousModel):
 
     def derivative(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return g (..., nx) at states (..., nx) and inputs (..., nu)."""
-        return self._called("function", self._function, states, inputs)
+        return self._function(states, inputs)
 
     def jacobians(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return dg/dz (..., nx, nx+nu) at states (..., nx) and inputs (..., nu)."""
-        if callable(self._jacobians):
-            given = self._jacobians
-            return self._called("jacobians", lambda x, u: _paired(given(x, u)), states, inputs, 1)
+        if isinstance(self._jacobians, Batched):
+            return self._jacobians(states, inputs)
         z = joined(states, inputs)
-        if self._jacobians == "central":
-            found = differences(lambda z: self.derivative(z[..., : self.nx], z[..., self.nx :]), z)
-        else:
+        if self._jacobians == "complex":
             n = z.shape[-1]
             aside = 1j * _COMPLEX_STEP * np.eye(n).reshape(n, *(1,) * (z.ndim - 1), n)
-            moved = z + aside
-            there = self._called(
-                "function", self._function, moved[..., : self.nx], moved[..., self.nx :]
-            )
-            found = np.imag(there) / _COMPLEX_STEP
-        return np.moveaxis(found, 0, -1)
+            slopes: FloatArray = np.moveaxis(np.imag(self._at(z + aside)) / _COMPLEX_STEP, 0, -1)
+            return slopes
+        if not self.discrete:
+            return differences(self._at, z)
+        return np.eye(self.nx, z.shape[-1]) + differences(self._increment, *self._nearby(z))
+
+    def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return sum_k m_k (Hessian of g_k in z), (..., n, n), for weights m (..., nx)."""
+        z, function = joined(states, inputs), self._at
+        about: tuple[FloatArray, Any] = z, 1.0
+        if self.discrete:
+            function, about = self._increment, self._nearby(z)
+        return second_differences(lambda z: (function(z) * weights).sum(axis=-1), *about)
 
     def advance(
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
@@ -179,10 +209,12 @@ class FunctionModel(ContinuousModel):
         costates: FloatArray,
         fraction: ArrayLike = 1.0,
     ) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in z), (..., n, n)."""
-        if self.discrete:
-            return Model.curvature(self, states, inputs, costates, fraction)
-        return super().curvature(states, inputs, costates, fraction)
+        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over that share of an interval."""
+        if not self.discrete:
+            return super().curvature(states, inputs, costates, fraction)
+        x, u, h = self._broadcast(states, inputs, fraction)
+        share = h * (self.substeps / self.dt)
+        return self.hessian(x, u, share * costates)
 
     def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,) by which the position comes to rest."""
@@ -197,31 +229,59 @@ class FunctionModel(ContinuousModel):
         wanted = (*np.shape(position)[:-1], self.nx)
         return as_array("state", self._state(position, velocity), wanted)
 
-    def _called(
-        self, name: str, function: Function, states: FloatArray, inputs: FloatArray, axes: int = 0
-    ) -> FloatArray:
-        """Values (..., nx) or (..., nx, n) of a user's function, looped over if need be."""
-        lead = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1])
-        shape = (*lead, self.nx, *(self.nx + self.nu,) * axes)
-        states = np.broadcast_to(states, (*lead, self.nx))
-        inputs = np.broadcast_to(inputs, (*lead, self.nu))
-        if self._vectorised:
-            values = np.asarray(function(states, inputs))
-        else:
-            pairs = zip(states.reshape(-1, self.nx), inputs.reshape(-1, self.nu), strict=True)
-            rows = [np.asarray(function(x, u)) for x, u in pairs]
-            if wrong := [row.shape for row in rows if row.shape != shape[len(lead) :]]:
-                raise ShapeError(name, f"shape {wrong[0]} returned, {shape[len(lead) :]} needed")
-            values = np.stack(rows).reshape(shape)
-        if values.shape != shape:
-            raise ShapeError(name, f"shape {values.shape} returned, {shape} needed")
-        return values
+    def _compare(self, z: FloatArray, tolerance: float) -> None:
+        """See the base class: g and J, not what Runge-Kutta steps make of them."""
+        given = self.jacobians(z[..., : self.nx], z[..., self.nx :])
+        require_agreement("AB", self._at, z, given, self.nx, tolerance)
+
+    def _at(self, z: FloatArray) -> FloatArray:
+        return self._function(z[..., : self.nx], z[..., self.nx :])
+
+    def _increment(self, z: FloatArray) -> FloatArray:
+        """Return g(x, u) - x."""
+        return self._at(z) - z[..., : self.nx]
+
+    def _nearby(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (..., n) with the increments of others, their positions zero where that may be.
+
+        Returns:
+            They, and how large the numbers (..., 1) are that increments are differences of.
+        """
+        if not self._movable:
+            return z, np.abs(self._at(z)).max(axis=-1, keepdims=True)
+        both = np.stack([z, z])
+        both[1, ..., self.position] = 0.0
+        values = self._at(both)
+        sizes = np.abs(values) + np.abs(both[..., : self.nx])
+        there, here = values - both[..., : self.nx]
+        rounding = _SAME * np.finfo(np.float64).eps * sizes.sum(axis=0)
+        alike = (np.abs(there - here) <= rounding).all(axis=-1, keepdims=True)
+        most = sizes.max(axis=-1, keepdims=True)
+        return np.where(alike, both[1], z), np.where(alike, most[1], most[0])
+
+    def _stands_at_zero(self, z: FloatArray) -> bool:
+        """Whether the function takes a position at zero, without an error of its own."""
+        near = z.copy()
+        near[self.position] = 0.0
+        try:
+            return bool(np.isfinite(self._at(near)).all())
+        except Exception:
+            return False
+
+    def _require_inputs(self, x: FloatArray, u: FloatArray) -> None:
+        """Refuse a function on which no input has an effect: its arguments may be swapped."""
+        try:
+            with np.errstate(all="ignore"):
+                values, others = (self.derivative(x, v) for v in (u, np.roll(u, 1, axis=0)))
+        except Exception:  # no function of all the plane
+            return
+        if np.array_equal(values, others, equal_nan=True):
+            raise InvalidArgumentError(
+                "function",
+                f"no input changes anything at {len(x)} random points; it is called with (x, u)",
+            )
 
 
-def _paired(pair: Any) -> FloatArray:
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise InvalidArgumentError("jacobians", "the pair dg/dx, dg/du is needed")
-    by_x, by_u = (np.asarray(part) for part in pair)
-    if by_x.ndim < 2 or by_x.shape[:-1] != by_u.shape[:-1]:
-        raise ShapeError("jacobians", f"shapes {by_x.shape} and {by_u.shape} are no pair")
-    return np.concatenate([by_x, by_u], axis=-1)
+def _trials(nx: int, nu: int) -> int:
+    """A number of points that is no size of the model's."""
+    return next(count for count in (7, 11, 13) if count not in (nx, nu))

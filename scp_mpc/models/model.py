@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray, IntArray, as_array, as_number, frozen
 from scp_mpc.errors import BoundsError, InvalidArgumentError, JacobianError, ShapeError
+from scp_mpc.models.differences import differences, disagreement
 
-_STEP = float(np.finfo(np.float64).eps ** (1 / 3))
+_POINTS = 30  # at which derivatives are checked
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -121,7 +122,7 @@ class Model(ABC):
             both = np.concatenate([there.A, there.B], axis=-1)
             return (costates[..., None, :] @ both)[..., 0, :]
 
-        bent = np.moveaxis(differences(gradients, joined(states, inputs)), 0, -1)
+        bent = differences(gradients, joined(states, inputs))
         return 0.5 * (bent + np.swapaxes(bent, -2, -1))
 
     @abstractmethod
@@ -139,39 +140,87 @@ class Model(ABC):
         jump along it, and without speed they stay what they were.
         """
 
-    def check(self, x: ArrayLike, u: ArrayLike, tolerance: float = 1e-6) -> None:
-        """Compare `linearise` with central differences of `advance` at a state and an input.
+    def check(
+        self, x: ArrayLike | None = None, u: ArrayLike | None = None, tolerance: float = 1e-6
+    ) -> None:
+        """Compare the derivatives, second ones included, with differences.
+
+        One state and input, or None, stand for 24 random ones about them, too, in one call and the
+        same ones each time: off by up to 0.1, 1 or 10 in each entry, headings by any angle. There
+        a model need not be finite. An entry is wrong if it is off by more than a share of itself,
+        by more than rounding, and by more than the spread of three differences explain.
 
         Args:
-            x: (nx,) or (..., nx).
-            u: (nu,) or (..., nu).
-            tolerance: Accepted difference, times the larger of 1 and the row's largest entry.
+            x: (nx,) or (..., nx); None for random ones about zero.
+            u: (nu,) or (..., nu); None for random ones about `equilibrium_input`.
+            tolerance: Accepted difference, relative to each entry.
 
         Raises:
             ShapeError: x or u has another width.
             JacobianError: With the worst entry's row and column and both numbers.
-            NotFiniteError: The model returns NaN or infinity there.
+            NotFiniteError: The model returns NaN or infinity at a given point.
         """
-        states = as_array("x", x)
-        inputs = as_array("u", u)
+        states = as_array("x", np.zeros(self.nx) if x is None else x)
+        inputs = as_array("u", self.equilibrium_input if u is None else u)
         for name, array, size in (("x", states, self.nx), ("u", inputs, self.nu)):
             if array.shape[-1:] != (size,):
                 raise ShapeError(name, f"shape {array.shape} does not fit (..., {size})")
-        z = joined(states, inputs)
-        given = self.linearise(states, inputs)
-        found = differences(lambda z: self.advance(z[..., : self.nx], z[..., self.nx :]), z)
-        both = as_array("linearise", np.concatenate([given.A, given.B], axis=-1))
-        slopes = as_array("advance", np.moveaxis(found, 0, -1))
-        scale = np.maximum(1.0, np.abs(slopes).max(axis=-1, keepdims=True))
-        error = np.abs(both - slopes) / scale
-        if error.max() > tolerance:
-            at = tuple(int(i) for i in np.unravel_index(np.argmax(error), error.shape))
-            row, column = at[-2:]
-            matrix = "A" if column < self.nx else "B"
-            raise JacobianError(
-                f"{matrix}[{row}, {column - self.nx * (matrix == 'B')}]",
-                f"{both[at]:.9g} is given, differences of the model say {slopes[at]:.9g}",
-            )
+        as_array("advance", self.advance(states, inputs))
+        if x is not None or u is not None:
+            self._compare(joined(states, inputs), tolerance)
+        if states.ndim == inputs.ndim == 1:
+            z = joined(*self._random_points(states, inputs, _POINTS))
+            with np.errstate(all="ignore"):
+                z = z[np.isfinite(self._values(z)).all(axis=-1)]
+                if len(z):
+                    self._compare(z, tolerance)
+
+    def _compare(self, z: FloatArray, tolerance: float) -> None:
+        """Raise where derivatives at points (..., n) are not those of differences."""
+        nx, slopes = self.nx, self._slopes
+        require_agreement("AB", self._values, z, slopes(z), nx, tolerance)
+        y = np.random.default_rng(1).normal(size=nx)
+        bent = self.curvature(z[..., :nx], z[..., nx:], np.broadcast_to(y, z[..., :nx].shape))
+        require_agreement("curvature", lambda z: y @ slopes(z), z, bent, nx, tolerance)
+
+    def _values(self, z: FloatArray) -> FloatArray:
+        return self.advance(z[..., : self.nx], z[..., self.nx :])
+
+    def _slopes(self, z: FloatArray) -> FloatArray:
+        there = self.linearise(z[..., : self.nx], z[..., self.nx :])
+        return np.concatenate([there.A, there.B], axis=-1)
+
+    def _random_points(
+        self, x: FloatArray, u: FloatArray, count: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """States (count, nx) and inputs (count, nu) about one of each; the same ones each time."""
+        rng = np.random.default_rng(0)
+        reach = np.resize([1.0, 0.1, 10.0, 0.01, 100.0, 0.001], count)[:, None]
+        states = x + reach * rng.uniform(-1.0, 1.0, (count, self.nx))
+        if self.heading is not None:
+            states[:, self.heading] = rng.uniform(-np.pi, np.pi, count)
+        return states, u + reach * rng.uniform(-1.0, 1.0, (count, self.nu))
+
+
+def require_agreement(
+    what: str,
+    function: Any,
+    z: FloatArray,
+    given: FloatArray,
+    nx: int,
+    tolerance: float,
+) -> None:
+    """Raise where given derivatives (..., m, n) of a function (..., m) of z (..., n) are not so."""
+    found = disagreement(function, z, as_array("derivatives", given), tolerance)
+    if found is None:
+        return
+    row, column = found[0][-2:]
+    if what == "AB":
+        what, column = ("A", column) if column < nx else ("B", column - nx)
+    raise JacobianError(
+        f"{what}[{row}, {column}]",
+        f"{given[found[0]]:.9g} is given, differences of the model say {found[1]:.9g}",
+    )
 
 
 def as_period(dt: object) -> float:
@@ -247,14 +296,3 @@ def joined(states: FloatArray, inputs: FloatArray) -> FloatArray:
     shape = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1])
     parts = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in (states, inputs)]
     return np.concatenate(parts, axis=-1)
-
-
-def differences(function: Any, z: FloatArray) -> FloatArray:
-    """Central differences (n, ..., m) of a batched function of z (..., n)."""
-    n = z.shape[-1]
-    h = _STEP * np.maximum(1.0, np.abs(z))
-    aside = np.moveaxis(h[..., None] * np.eye(n), -2, 0)
-    forward, backward = z + aside, z - aside
-    values = function(np.stack([forward, backward]))
-    width = np.moveaxis(h, -1, 0)[..., None]
-    return (values[0] - values[1]) / (2 * width)

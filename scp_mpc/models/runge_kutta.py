@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.models.model import Linearisation, Model, differences, joined
+from scp_mpc.models.differences import differences
+from scp_mpc.models.model import Linearisation, Model, joined
 
 _NODES = (0.0, 0.5, 0.5, 1.0)
 _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -55,7 +56,7 @@ class ContinuousModel(Model):
             both = self.jacobians(z[..., : self.nx], z[..., self.nx :])
             return (weights[..., None, :] @ both)[..., 0, :]
 
-        bent = np.moveaxis(differences(gradients, joined(states, inputs)), 0, -1)
+        bent = differences(gradients, joined(states, inputs))
         return 0.5 * (bent + np.swapaxes(bent, -2, -1))
 
     def advance(
