@@ -20,6 +20,7 @@ from scp_mpc.errors import (
     GeometryError,
     InvalidArgumentError,
     JacobianError,
+    MissingExtraError,
     NotFiniteError,
     ScpMpcError,
     ShapeError,
@@ -28,6 +29,7 @@ from scp_mpc.errors import (
 )
 from scp_mpc.geometry import Containment, JointRisk, Margin, StageRisk
 from scp_mpc.models import (
+    CasadiModel,
     ContinuousModel,
     Disturbed,
     DoubleIntegrator,
@@ -59,6 +61,7 @@ __all__ = [
     "MPC",
     "SCP",
     "BoundsError",
+    "CasadiModel",
     "CircularObstacle",
     "CircularReference",
     "ConcurrentUseError",
@@ -78,6 +81,7 @@ __all__ = [
     "KinematicBicycle",
     "LinearModel",
     "Margin",
+    "MissingExtraError",
     "Model",
     "NotFiniteError",
     "ObstaclePrediction",

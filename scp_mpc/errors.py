@@ -51,6 +51,10 @@ class GeometryError(InvalidArgumentError):
     """Points or half-spaces do not make a convex body with an inside."""
 
 
+class MissingExtraError(ScpMpcError, ImportError):
+    """An optional package is not installed; it names the extra that brings it along."""
+
+
 class ConcurrentUseError(ScpMpcError):
     """One solver was called from two threads at once; each needs its own."""
 

@@ -1,6 +1,7 @@
 """Models: the discrete-time dynamics f, one family per file."""
 
 from scp_mpc.models.bicycle import KinematicBicycle
+from scp_mpc.models.casadi import CasadiModel
 from scp_mpc.models.disturbed import Disturbed
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.models.function import FunctionModel
@@ -20,6 +21,7 @@ from scp_mpc.models.runge_kutta import ContinuousModel
 from scp_mpc.models.unicycle import Unicycle
 
 __all__ = [
+    "CasadiModel",
     "ContinuousModel",
     "Disturbed",
     "DoubleIntegrator",

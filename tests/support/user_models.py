@@ -15,9 +15,8 @@ def _unicycle(x, u):
 
 
 def _bicycle(x, u):
-    return (
-        x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(0.3 * np.sin(x[4])) / 2.5, u[0], u[1],
-    )  # fmt: skip
+    omega = x[3] * np.tan(0.3 * np.sin(x[4])) / 2.5
+    return x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), omega, u[0], u[1]
 
 
 def _drag(x, u):
@@ -32,8 +31,13 @@ def _terrain(x, u):
 
 
 def _planar_quadrotor(x, u):
-    return x[3], x[4], x[5], -(u[0] + u[1]) * np.sin(x[2]), (u[0] + u[1]) * np.cos(x[2]) - 9.81, (
-        (u[1] - u[0]) * 4.0
+    return (
+        x[3],
+        x[4],
+        x[5],
+        -(u[0] + u[1]) * np.sin(x[2]),
+        (u[0] + u[1]) * np.cos(x[2]) - 9.81,
+        ((u[1] - u[0]) * 4.0),
     )
 
 
