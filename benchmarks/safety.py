@@ -3,10 +3,11 @@
     python benchmarks/safety.py --kind moving --episodes 2000 --out out/safety
 
 Each episode draws a world and drives through it: `MPC` without a deadline, whose model is exact and
-whose predictions come true. From the first ok step on, every step is to be ok, and there is to be
-no contact in continuous time. Goals count as reachable where a grid search proves them to be, with
-clearance and time to spare. A rerun with the same folder does what is missing; one folder for each
-version of the code.
+whose predictions come true. Its reference is the shortest path around what stands; in the first few
+worlds it drives once more, with the goal alone as reference. From the first ok step on, every step
+is to be ok, and there is to be no contact in continuous time. Goals count as reachable where a grid
+search proves them to be, with clearance and time to spare. A rerun with the same folder does what
+is missing; one folder for each version of the code.
 """
 
 import argparse
@@ -21,13 +22,14 @@ import numpy as np
 
 from benchmarks.processes import in_one_thread
 from benchmarks.progress import progress
+from benchmarks.safety_drive import Drive, drive
 from benchmarks.safety_search import is_reachable
-from benchmarks.safety_worlds import SHARES, Drive, World, drive
+from benchmarks.safety_worlds import SHARES, World
 from benchmarks.tables import table, write
 from scp_mpc.scp.braking import AT_REST
 from scp_mpc.simulation.episodes import run_episodes
 
-EPISODES = 2000
+EPISODES, ALONE = 2000, 60
 TOUCHING = -1e-5  # [m], beyond the tolerance of the plans and of the judge
 _KINDS = ("standing", "moving")
 
@@ -36,6 +38,7 @@ def main(
     kind: str,
     out: Path,
     episodes: int = EPISODES,
+    alone: int = ALONE,
     jobs: int = 1,
     echo: Callable[[str], object] = lambda _: None,
 ) -> None:
@@ -43,27 +46,30 @@ def main(
 
     Args:
         kind: Of the obstacles, "standing" or "moving".
-        out: Folder for safety-kind.jsonl, .md and .json.
+        out: Folder for safety-kind.jsonl, -alone.jsonl, .md and .json.
         episodes: How many; their seeds are 0, 1, ...
+        alone: How many of them once more, with the goal alone as reference.
         jobs: Processes.
         echo: Takes the Markdown table.
     """
     name = f"safety-{kind}"
-    rows = in_one_thread(_rows, kind, episodes, out / f"{name}.jsonl", jobs)
-    total = summarise(rows)
-    write(out, name, markdown(total), total | {"kind": kind, "broken": broken(rows)}, echo=echo)
+    rows = in_one_thread(_rows, kind, episodes, out / f"{name}.jsonl", jobs, True)
+    less = in_one_thread(_rows, kind, alone, out / f"{name}-alone.jsonl", jobs, False)
+    totals = {"path": summarise(rows), "goal alone": summarise(less)}
+    content = {"kind": kind, **totals, "broken": broken(rows)}
+    write(out, name.replace("-", "_"), markdown(totals), content, echo=echo)
 
 
-def _rows(kind: str, episodes: int, file: Path, jobs: int) -> list[dict[str, Any]]:
+def _rows(kind: str, episodes: int, file: Path, jobs: int, along: bool) -> list[dict[str, Any]]:
     with progress(episodes, "episode") as advance:
-        one = partial(episode, moving=kind == "moving")
+        one = partial(episode, moving=kind == "moving", along=along)
         return run_episodes(one, range(episodes), file=file, jobs=jobs, advance=advance)
 
 
-def episode(seed: int, moving: bool) -> dict[str, Any]:
+def episode(seed: int, moving: bool, along: bool = True) -> dict[str, Any]:
     """Drive through a world; what the world was and what happened."""
     world, began = World(seed, moving), process_time()
-    run = drive(world)
+    run = drive(world, along=along)
     seconds = process_time() - began
     return {
         "seed": seed,
@@ -154,28 +160,34 @@ def broken(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def markdown(total: dict[str, Any]) -> str:
-    """The summary in Markdown."""
+def markdown(totals: dict[str, dict[str, Any]]) -> str:
+    """The summaries in Markdown, a column for each reference."""
+    columns = [_cells(total) for total in totals.values()]
+    names = f"Reference: | {' | '.join(totals)}"
+    return table(
+        names,
+        "l" + "r" * len(totals),
+        [(name, *(cells[name] for cells in columns)) for name in columns[0]],
+    )
+
+
+def _cells(total: dict[str, Any]) -> dict[str, str]:
     share = 100 * total["arrived"] / max(total["reachable"], 1)
-    rows = [
-        ("episodes, control steps", f"{total['episodes']:,}, {total['steps']:,}"),
-        ("episodes without an ok step", f"{total['never_ok']:,}"),
-        (
-            "steps that are not ok after the first ok one (episodes)",
-            f"{total['not_ok_steps']:,} ({total['not_ok_episodes']:,})",
+    return {
+        "episodes, control steps": f"{total['episodes']:,}, {total['steps']:,}",
+        "episodes without an ok step": f"{total['never_ok']:,}",
+        "steps that are not ok after the first ok one (episodes)": (
+            f"{total['not_ok_steps']:,} ({total['not_ok_episodes']:,})"
         ),
-        (
-            "first contacts of a robot that moves, at rest",
-            f"{total['contacts_moving']:,}, {total['contacts_at_rest']:,}",
+        "first contacts of a robot that moves, at rest": (
+            f"{total['contacts_moving']:,}, {total['contacts_at_rest']:,}"
         ),
-        (
-            "arrived, of those whose goal is reachable",
-            f"{total['arrived']:,} of {total['reachable']:,} ({share:.1f} %)",
+        "arrived, of those whose goal is reachable": (
+            f"{total['arrived']:,} of {total['reachable']:,} ({share:.1f} %)"
         ),
-        ("median, slowest step [ms]", f"{total['median_ms']:.1f}, {total['max_ms']:.0f}"),
-        ("processor time [min]", f"{total['seconds'] / 60:.1f}"),
-    ]
-    return table("What | How much", "lr", rows)
+        "median, slowest step [ms]": f"{total['median_ms']:.1f}, {total['max_ms']:.0f}",
+        "processor time [min]": f"{total['seconds'] / 60:.1f}",
+    }
 
 
 if __name__ == "__main__":
@@ -185,5 +197,6 @@ if __name__ == "__main__":
     parser.add_argument("--kind", choices=_KINDS, required=True, help="of the obstacles")
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="worlds")
+    parser.add_argument("--alone", type=int, default=ALONE, help="of these without a path as well")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     main(**vars(parser.parse_args()), echo=print)

@@ -9,7 +9,8 @@ a proof; that nothing is found is none.
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from benchmarks.safety_worlds import NEAR, SECONDS, STAY, World
+from benchmarks.safety_drive import NEAR, SECONDS, STAY
+from benchmarks.safety_worlds import World
 
 CELL, MOST = 0.05, 4  # [m], and how many of them it goes in a step
 SPARE, SHARE = 0.1, 0.6  # [m] of clearance, and of the time of a drive

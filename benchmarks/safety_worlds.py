@@ -1,4 +1,4 @@
-"""Random worlds that keep their word, a drive through them, and a judge that knows the truth alone.
+"""Random worlds that keep their word, and a judge that knows the truth alone.
 
 The judge shares no code with the package: distances to discs and convex polygons by hand, the
 robot's way within an interval by Gauss-Legendre quadrature of its equations of motion.
@@ -7,16 +7,12 @@ Notation:
     K   control steps       T   instants in an interval     nv  corners
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.control.mpc import MPC
 from scp_mpc.models.bicycle import KinematicBicycle
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.models.model import Model
@@ -24,10 +20,7 @@ from scp_mpc.models.unicycle import Unicycle
 from scp_mpc.obstacles.polytope import Polytope
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
-from scp_mpc.scp.plan import Plan
-from scp_mpc.settings import Settings
 
-SECONDS, NEAR, STAY = 12.0, 0.3, 1.0  # a drive ends after so long, or so near the goal so long
 ROBOTS = ("double integrator", "unicycle", "bicycle")
 SHARES = np.linspace(0.0, 1.0, 129)  # of an interval; at 3 m/s and 0.2 s they miss 0.01 mm
 _WHEELBASE, _REAR, _STEERING = 0.5, 0.25, 0.6  # [m], [m], [rad]
@@ -36,16 +29,6 @@ _MANY = 8  # obstacles at most
 _STATE_WEIGHTS = ([1.0, 0.1, 1.0, 0.1], [1.0, 1.0, 0.01, 0.1], [1.0, 1.0, 0.01, 0.1, 0.01])
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # of [0, 1]
-
-
-class Controller(Protocol):
-    """What drives: `MPC`, or something worse."""
-
-    def step(
-        self, x0: ArrayLike, x_ref: ArrayLike, obstacles: Sequence[ObstaclePrediction], /
-    ) -> Plan:
-        """Return the plan for this control step."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,67 +183,3 @@ def _box(half: ArrayLike, angle: float) -> FloatArray:
     c, s = np.cos(angle), np.sin(angle)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
     return corners @ np.array([[c, s], [-s, c]])
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """What happened.
-
-    Attributes:
-        world: Where.
-        states: (K+1, nx) of the robot.
-        plans: K of them.
-        seconds: (K,) for each plan.
-        arrived: Whether it stayed near the goal.
-    """
-
-    world: World
-    states: FloatArray
-    plans: list[Plan]
-    seconds: FloatArray
-    arrived: bool
-
-    def places(self) -> FloatArray:
-        """(K+1, 2) positions of the robot [m]."""
-        return self.states[:, self.world.problem.model.position]
-
-    def first_ok(self) -> int | None:
-        """Index of the first ok step, from which on the promise holds; None for never."""
-        return next((k for k, plan in enumerate(self.plans) if plan.ok), None)
-
-    def gaps(self) -> FloatArray:
-        """(K, T, M) between the robot and each obstacle within each interval [m]."""
-        world, K = self.world, len(self.plans)
-        path = world.path(self.states[:-1], np.array([plan.u0 for plan in self.plans]))
-        times = world.dt * (np.arange(K)[:, None] + SHARES)
-        return np.stack([thing.gaps(path, times) for thing in world.things], -1) - world.radius
-
-    def speeds(self) -> FloatArray:
-        """(K, T) of the robot [m/s]."""
-        path = self.world.path(self.states[:-1], np.array([plan.u0 for plan in self.plans]))
-        step = np.diff(path, axis=1) / (SHARES[1] * self.world.dt)
-        speed = np.linalg.norm(step, axis=-1)
-        return np.concatenate([speed, speed[:, -1:]], axis=1)
-
-
-def drive(world: World, controller: Controller | None = None) -> Drive:
-    """Drive through a world until the robot stays near its goal or the time is over.
-
-    Args:
-        world: Where.
-        controller: Who; `MPC` without a deadline if None.
-    """
-    problem = world.problem
-    controller = MPC(problem, Settings(deadline=None)) if controller is None else controller
-    states, plans, seconds, near = [world.start], list[Plan](), list[float](), 0
-    for k in range(round(SECONDS / world.dt)):
-        told = world.predictions(k * world.dt)
-        began = perf_counter()
-        plans.append(controller.step(states[-1], world.x_ref, told))
-        seconds.append(perf_counter() - began)
-        states.append(problem.model.step(states[-1], plans[-1].u0))
-        away = np.linalg.norm(states[-1][problem.model.position] - world.goal)
-        near = near + 1 if away < NEAR else 0
-        if near * world.dt > STAY:
-            break
-    return Drive(world, np.array(states), plans, np.array(seconds), near * world.dt > STAY)

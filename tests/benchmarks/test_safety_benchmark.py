@@ -1,14 +1,17 @@
 """The benchmark of safety: its worlds, its judge and its search, against what is known by hand."""
 
 import json
+import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.safety import broken, episode, judged, main, summarise
+from benchmarks.safety_drive import Drive, drive
 from benchmarks.safety_search import is_reachable
-from benchmarks.safety_worlds import ROBOTS, SHARES, Drive, Thing, World, drive
+from benchmarks.safety_worlds import ROBOTS, SHARES, Thing, World
 from scp_mpc import MPC, Settings, Status
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -26,13 +29,19 @@ class Blind:
 
 
 def box(x, y, half, velocity=(0.0, 0.0)):
-    return Thing(np.array([x, y]), np.array(velocity), SQUARE * half, 0.0, np.zeros(31))
+    return Thing(np.array([x, y]), np.array(velocity), SQUARE * half, 0.0, np.zeros(1))
 
 
 def world(things, robot="double integrator"):
     """One with these things in it, 5 m to go at 2 m/s."""
-    found = next(w for w in map(World, range(99)) if w.robot == robot and w.dt == 0.2)
-    found.things, found.radius, found.goal, found.speed_max = things, 0.3, np.array([5.0, 0]), None
+    found = next(
+        w
+        for w in map(World, range(99))
+        if w.robot == robot and w.dt == 0.2 and len(w.things) >= len(things)
+    )
+    known = np.zeros(found.horizon + 1)
+    found.things = [replace(thing, variances=known) for thing in things]
+    found.radius, found.goal, found.speed_max = 0.3, np.array([5.0, 0]), None
     return found
 
 
@@ -53,7 +62,7 @@ def test_gaps_by_hand():
     points = np.array([[0.0, 0.0], [2.0, 0.1], [4.0, 1.5], [2.0, 0.0]])
     times = np.array([0.0, 0.0, 0.0, 1.0])
     np.testing.assert_allclose(square.gaps(points, times), [1.0, -0.4, np.sqrt(2), 0.5])
-    disc = Thing(np.array([3.0, 4.0]), STILL, np.zeros((1, 2)), 1.0, np.zeros(9))
+    disc = Thing(np.array([3.0, 4.0]), STILL, np.zeros((1, 2)), 1.0, np.zeros(1))
     np.testing.assert_allclose(disc.gaps(np.array([[0.0, 0.0], [3.0, 4.0]]), 7.0), [4.0, -1.0])
 
 
@@ -69,7 +78,7 @@ def test_the_judges_way_is_the_models(robot):
 
 def test_a_contact_between_two_samples_is_found():
     """0.4 m per interval, past something that is touched halfway."""
-    peg = Thing(np.array([0.6, 0.33]), STILL, np.zeros((1, 2)), 0.04, np.zeros(31))
+    peg = Thing(np.array([0.6, 0.33]), STILL, np.zeros((1, 2)), 0.04, np.zeros(1))
     states = np.array([[0.4 * k, 2.0, 0, 0] for k in range(4)])
     plan = SimpleNamespace(
         u0=np.zeros(2), ok=True, status=Status.CONVERGED, slack=np.zeros(1), x_slack=np.zeros(1)
@@ -108,17 +117,25 @@ def test_the_search_finds_doors(things, reachable):
 
 def test_a_blind_controller_is_caught():
     worlds = [World(seed) for seed in range(4)]
-    rows = [judged(drive(w, Blind(w.problem))) for w in worlds]
+    rows = [judged(drive(w, Blind(w.problem), along=False)) for w in worlds]
     assert any(row["contact"] and row["contact"]["speed"] > 0.5 for row in rows)
     assert not any(row["not_ok"] for row in rows)
 
 
+def test_a_path_leads_out_of_a_pocket(monkeypatch):
+    """Where the goal alone leaves the robot standing."""
+    monkeypatch.setattr("benchmarks.safety_drive.SECONDS", 8.0)
+    pocket = [box(2.5, 0.0, [0.1, 1.2]), *(box(1.8, y, [0.7, 0.1]) for y in (-1.2, 1.2))]
+    assert not drive(world(pocket), along=False).arrived
+    assert drive(world(pocket)).arrived
+
+
 @pytest.mark.slow
 def test_a_run_goes_on_where_it_ended(tmp_path):
-    main("standing", tmp_path, episodes=1)
+    main("standing", tmp_path, episodes=1, alone=1)
     shown = []
-    main("standing", tmp_path, episodes=2, echo=shown.append)
-    assert "| episodes, control steps | 2, " in shown[0]
+    main("standing", tmp_path, episodes=2, alone=1, echo=shown.append)
+    assert re.search(r"\| episodes, control steps \| 2, [0-9]+ \| 1, ", shown[0])
     lines = (tmp_path / "safety-standing.jsonl").read_text().split("\n")[1:]
     assert [json.loads(line)["seed"] for line in lines] == [0, 1]
     row = json.loads(lines[1])["row"]
