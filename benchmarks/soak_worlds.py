@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.errors import NotFiniteError, ScpMpcError, ShapeError, TooManyObstaclesError
+from scp_mpc.errors import NotFiniteError, ScpMpcError, ShapeError
 from scp_mpc.geometry.margin import JointRisk, Margin, StageRisk
 from scp_mpc.models.double_integrator import DoubleIntegrator
 from scp_mpc.obstacles.prediction import ObstaclePrediction
@@ -217,11 +217,6 @@ FAULTS: list[Fault] = [
     ("infinite x0", NotFiniteError, lambda step, x, ref, _: step(x + np.inf, ref)),
     ("short x0", ShapeError, lambda step, x, ref, _: step(x[:-1], ref)),
     ("long prediction", ShapeError, lambda step, x, ref, p: step(x, ref, _crowd(p, 99, 1))),
-    (
-        "too many obstacles",
-        TooManyObstaclesError,
-        lambda step, x, ref, p: step(x, ref, _crowd(p, p.horizon + 1, SLOTS + 1)),
-    ),
     (
         "NaN in a prediction",
         NotFiniteError,

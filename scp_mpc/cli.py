@@ -198,7 +198,7 @@ def replay(
     with _one_line_errors():
         if (start is None) != (goal is None):
             raise InvalidArgumentError("start", "goes with a goal, and a goal with a start")
-        tracking = TrackerSettings(confirmations=1, std_inflation=std_inflation)
+        tracking = TrackerSettings(std_inflation=std_inflation)
         problem = replay_problem(horizon, Containment(level), obstacles)
         recording = _recording(file, rate, layout)
         if start is not None and goal is not None:

@@ -117,6 +117,22 @@ class Backup:
         rest = np.tile(model.equilibrium_input, (self._planned, 1))
         return np.concatenate([inputs, stop, rest])[: self._planned]
 
+    def path(self, x: FloatArray, inputs: FloatArray | None, last: FloatArray | None) -> FloatArray:
+        """States (N+1, nx) of an earlier backup, or of braking from now on, then of rest.
+
+        Args:
+            x: (nx,) state now.
+            inputs: (k, nu) what is left of its plan; None for no backup.
+            last: (nu,) input last applied, or None.
+        """
+        model, N = self._problem.model, self._planned
+        if inputs is None:
+            inputs = np.zeros((0, model.nu))
+        states = rollout(model.step, x, inputs).states
+        stop = self.stopping(states[-1], inputs[-1] if len(inputs) else last)[1]
+        path = np.concatenate([states[:-1], stop])
+        return path[np.minimum(np.arange(N + 1), len(path) - 1)]
+
     def _is_far(self, end: FloatArray, obstacles: Sequence[ObstaclePrediction]) -> bool:
         """Whether nothing can be met while braking, from the last two positions (2, d)."""
         dt = self._problem.model.dt

@@ -1,6 +1,7 @@
 """Model predictive control: the solver with a memory of its last plan and of the obstacles.
 
 what is known of the obstacles now: reports brought up to the present, vanished ones kept
+the most dangerous of them, where there are more than slots
 nominal = previous plan, shifted
 plan = SCP (or braking, where a report is too old)
 backup = the plan, then braking to rest beyond its horizon; the last one, where this has none
@@ -19,9 +20,10 @@ from numpy.typing import ArrayLike
 from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.control.backup import Backup
 from scp_mpc.control.obstacle_memory import ObstacleMemory, Recall
+from scp_mpc.control.selection import most_dangerous
 from scp_mpc.deadline import Clock, Timer
-from scp_mpc.errors import ConcurrentUseError
-from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.errors import ConcurrentUseError, TooManyObstaclesError
+from scp_mpc.obstacles.prediction import ObstaclePrediction, require_fitting
 from scp_mpc.problem import ROUNDING, Problem
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Plan, Status
@@ -51,9 +53,7 @@ class MPC:
         """Set up the solver; there is no plan yet."""
         self._solver = SCP(problem, settings, timer)
         self._deadline = self.settings.time_limit(self.problem.model.dt)
-        self._memory = ObstacleMemory(
-            self.settings.staleness, problem.model.dt, problem.max_obstacles
-        )
+        self._memory = ObstacleMemory(self.settings.staleness, problem.model.dt)
         self._backups = Backup(self.problem, self.settings.tolerance)
         self._busy = Lock()
         self._counts: Counter[Status] = Counter()
@@ -66,7 +66,7 @@ class MPC:
         self._steps_touching = 0
         self._obstacles: tuple[ObstaclePrediction, ...] = ()
         self._counts.clear()
-        self.overruns = self.replayed = 0
+        self.overruns = self.replayed = self._left_out = 0
         self._memory.reset()
 
     @property
@@ -111,11 +111,13 @@ class MPC:
         Args:
             x0: (nx,) state now.
             x_ref: (N+1, nx) reference, or (nx,) to be held; row 0 is not weighted.
-            obstacles: At most `max_obstacles` predictions over the same horizon. What happens to
-                late ones, and to named ones that are no longer given, is said by
-                `settings.staleness`.
+            obstacles: Predictions over the same horizon. What happens to late ones, and to named
+                ones that are no longer given, is said by `settings.staleness`. Of more than
+                `max_obstacles` the nearest to the last plan and its backup count, and
+                `plan.left_out` says how many did not.
             time: Now [s], on the clock of the predictions' stamps; None for one interval after the
-                last step that returned a plan, or 0 at the first.
+                last step that returned a plan, or 0 at the first. Where stamps are not of such a
+                clock, or steps before had a time, a missing one is refused.
             robot_covariance: (d, d) or (N+1, d, d) of the robot's own position [m^2].
             u_last: (nu,) input last applied, from which the first rate counts. None for `u0` of the
                 last plan that this controller returned; at the first step, and at the first after
@@ -132,6 +134,9 @@ class MPC:
             last = self._applied if self.problem.limits_rates else None
             if u_last is not None:
                 last = as_array("u_last", u_last, (self.problem.model.nu,))
+            known = len(recall.obstacles)
+            if known > self.problem.max_obstacles:
+                recall = recall._replace(obstacles=self._chosen(x0, x_ref, recall.obstacles, last))
             plan = self._plan(x0, x_ref, recall, robot_covariance, clock, last)
             backup = None
             ahead = bool(recall.obstacles) or self._backups.always
@@ -143,6 +148,7 @@ class MPC:
             sound = self._within(plan, last)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref, last)
+            plan = self._counted(plan, known)
             self._memory.commit(recall)
             self._keep(plan, recall, plan.iterate if sound else None)
             self._backup = backup if sound else None
@@ -167,6 +173,35 @@ class MPC:
             raise ConcurrentUseError(
                 "this controller is at work in another thread; give each its own"
             )
+
+    def _chosen(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: tuple[ObstaclePrediction, ...],
+        last: FloatArray | None,
+    ) -> tuple[ObstaclePrediction, ...]:
+        """As many as there are slots for: nearest to the nominal plan and to the last backup."""
+        problem = self.problem
+        if not problem.max_obstacles:
+            raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = 0")
+        require_fitting(obstacles, problem.horizon, problem.model.dim, problem.model.dt)
+        step, nominal = Step.read(problem, x0, x_ref, (), u_last=last), self.nominal()
+        ahead = step.x_ref if nominal is None else nominal.states + (step.x0 - nominal.states[0])
+        backup = self._backups.path(step.x0, self._backup, last)
+        paths = np.stack([ahead, backup])[..., problem.model.position]
+        return most_dangerous(problem, obstacles, paths)
+
+    def _counted(self, plan: Plan, known: int) -> Plan:
+        """The plan with how many of the known obstacles were left out; said once, too."""
+        left_out, before = max(known - self.problem.max_obstacles, 0), self._left_out
+        self._left_out = left_out
+        if left_out and not before:
+            _log.warning(
+                "%d obstacles, but max_obstacles = %d: the nearest to the plan are kept",
+                *(known, self.problem.max_obstacles),
+            )
+        return replace(plan, left_out=left_out) if left_out else plan
 
     def _plan(
         self,

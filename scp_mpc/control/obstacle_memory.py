@@ -3,18 +3,17 @@
 Nothing here changes before `commit`: a step that fails in between leaves no trace.
 """
 
-import logging
 from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import InvalidArgumentError, StaleDataError
 from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
 from scp_mpc.obstacles.propagation import propagated
 from scp_mpc.settings import StalenessPolicy
-
-_log = logging.getLogger(__name__)
 
 _TICK = 1e-6  # [s]; sums of intervals and differences of large times are no more exact than that
 
@@ -42,12 +41,16 @@ class Recall(NamedTuple):
             those given, as they are, where one of them is too old.
         stale: Which one is too old to plan with; None if none is.
         reports: What to remember.
+        timed: Whether this step or one before was given its time.
+        newest: Latest stamp of this step, or of the last one that had any; None for none yet.
     """
 
     time: float
     obstacles: tuple[ObstaclePrediction, ...]
     stale: StaleDataError | None
     reports: Mapping[Hashable, Report]
+    timed: bool
+    newest: float | None
 
 
 _NOTHING: Mapping[Hashable, Report] = MappingProxyType({})
@@ -61,43 +64,50 @@ class ObstacleMemory:
     Args:
         staleness: How old is too old, and how fast uncertainty grows.
         dt: Interval of the predictions and of steps without a given time [s].
-        slots: Most obstacles that a step can be planned with.
     """
 
-    def __init__(self, staleness: StalenessPolicy, dt: float, slots: int) -> None:
+    def __init__(self, staleness: StalenessPolicy, dt: float) -> None:
         """Start with nothing known, at no time."""
         self._staleness = staleness
         self._dt = dt
-        self._slots = slots
         self.reset()
 
     def reset(self) -> None:
         """Forget every obstacle and the time."""
         self._time: float | None = None
         self._reports: Mapping[Hashable, Report] = _NOTHING
+        self._timed = False
+        self._newest: float | None = None
 
     def commit(self, recall: Recall) -> None:
         """Take over what a step has made of the reports, once it has succeeded."""
         self._time, self._reports = recall.time, recall.reports
+        self._timed, self._newest = recall.timed, recall.newest
 
     def recall(self, time: float | None, obstacles: Iterable[ObstaclePrediction]) -> Recall:
         """Return what to plan with at this step; `commit` it afterwards.
 
         Args:
-            time: Of this step [s]; None for one interval after the last step, or 0.
+            time: Of this step [s]; None for one interval after the last step, or 0. Stamps then
+                have to be of such a clock, and no step before may have been given its time.
             obstacles: This step's predictions.
 
         Raises:
             InvalidArgumentError: These are no predictions, or two have the same name.
-            StaleDataError: `time` runs backwards, a stamp is in the future, or one that is
-                required is missing.
+            StaleDataError: `time` runs backwards, a stamp is in the future, one that is
+                required is missing, or stamps are of another clock.
         """
         given = as_predictions(obstacles)
         required = self._staleness.stamps == "required"
         now = self._now(time, required)
+        stamps = [o.stamp for o in given if o.stamp is not None]
+        newest = max(stamps, default=self._newest)
+        if time is None and stamps:
+            self._require_own_clock(now, max(stamps))
+        clock = self._timed or time is not None, newest
         plain = all(o.stamp is None and o.name is None for o in given)
         if plain and not self._reports and not (required and given):
-            return Recall(now, given, None, _NOTHING)
+            return Recall(now, given, None, _NOTHING, *clock)
         since = [self._since(j, o, now, required) for j, o in enumerate(given)]
         reports = {
             o.name: Report(o, s, now)
@@ -109,14 +119,11 @@ class ObstacleMemory:
         known = kept | reports
         stale = self._stale(given, since, now)
         if stale is not None:
-            return Recall(now, given, stale, known)
+            return Recall(now, given, stale, known, *clock)
         late = self._staleness.grow_after
         present = [self._as_of(now, o, s, late) for o, s in zip(given, since, strict=True)]
-        absent = [
-            self._as_of(now, report.prediction, report.since)
-            for report in self._latest(kept, room=self._slots - len(given))
-        ]
-        return Recall(now, (*present, *absent), None, known)
+        absent = [self._as_of(now, report.prediction, report.since) for report in kept.values()]
+        return Recall(now, (*present, *absent), None, known, *clock)
 
     def _now(self, time: float | None, required: bool) -> float:
         last = self._time
@@ -126,8 +133,27 @@ class ObstacleMemory:
             return 0.0 if last is None else last + self._dt
         now = as_number("time", time)
         if last is not None and now < last - _TICK:
-            raise StaleDataError("time", f"{now} s is before the last step's {last} s")
+            raise StaleDataError(
+                "time", f"{now} s is before the last step's {last} s; reset() forgets that"
+            )
         return now
+
+    def _require_own_clock(self, now: float, newest: float) -> None:
+        """Raise where stamps are given without a time, and are not of the clock that counts steps.
+
+        The first ones may be old, and the same ones may be handed over again; new ones are of now.
+        """
+        if self._timed:
+            raise StaleDataError(
+                "time", f"missing, but a step before had one, and a stamp is {newest} s"
+            )
+        off, most = newest - now, self._staleness.grow_after + _TICK
+        if newest != self._newest and (off > most or (off < -most and self._newest is not None)):
+            raise StaleDataError(
+                "time",
+                f"missing, and a stamp of {newest} s is {off:+g} s off the clock that counts steps "
+                f"of {self._dt:g} s, {now:g} s: tell each step its time",
+            )
 
     def _since(self, j: int, obstacle: ObstaclePrediction, now: float, required: bool) -> float:
         """Time of row 0."""
@@ -154,25 +180,17 @@ class ObstacleMemory:
             if name not in reports and report.heard >= oldest
         }
 
-    def _latest(self, kept: Mapping[Hashable, Report], room: int) -> list[Report]:
-        """As many as there is room for: those heard of last."""
-        if len(kept) <= room:
-            return list(kept.values())
-        room = max(room, 0)
-        _log.warning(
-            "%d vanished obstacles are to be kept, but max_obstacles = %d leaves room for %d: "
-            "the oldest are left out",
-            *(len(kept), self._slots, room),
-        )
-        return sorted(kept.values(), key=lambda r: (r.heard, r.since), reverse=True)[:room]
-
     def _as_of(
         self, now: float, prediction: ObstaclePrediction, since: float, late: float = 0.0
     ) -> ObstaclePrediction:
-        """The prediction moved on to the present, unless it is younger than `late` seconds."""
-        if now - since <= late + _TICK:
+        """The prediction at the present: moved on if it is older than `late` seconds, or back."""
+        age = now - since
+        if age < -_TICK:
+            rows = np.arange(prediction.horizon + 1) + age / self._dt
+            return prediction.with_rows(*prediction.interpolated(rows), now)
+        if age <= late + _TICK:
             return prediction
-        return propagated(prediction, now - since, self._dt, self._staleness.growth)
+        return propagated(prediction, age, self._dt, self._staleness.growth)
 
     def _stale(
         self, given: tuple[ObstaclePrediction, ...], since: list[float], now: float

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.report.animation import OnePaletteWriter
 from scp_mpc.report.canvas import (
     HALF_PLANE,
@@ -130,7 +131,7 @@ def _draw_step(axes: Axes, run: Run, k: int) -> None:
     for share, alpha in _FADING:
         stage = round(share * problem.horizon)
         label = f"no-go sets in {stage * problem.model.dt:g} s, of the {_SHOWN} nearest"
-        for told in run.predictions[k][:_SHOWN]:
+        for told in _nearest(run, k):
             around = no_go_outline(problem, told, stage, problem.size.reference)
             axes.plot(*around.T, color=OBSTACLE, alpha=alpha, linewidth=1.0, label=label)
     _draw_ends(axes, run)
@@ -143,6 +144,13 @@ def _draw_step(axes: Axes, run: Run, k: int) -> None:
             axes.add_patch(Circle(place, body.radius, color=OBSTACLE, label="people", zorder=4))
     here, radius = run.positions[k], problem.robot_radius
     axes.add_patch(Circle(here, radius, color=ROBOT, label="robot", zorder=4))
+
+
+def _nearest(run: Run, k: int) -> list[ObstaclePrediction]:
+    """Those of whom the robot was told that were nearest to it at a step."""
+    here = run.positions[k]
+    told = sorted(run.predictions[k], key=lambda o: float(np.linalg.norm(o.means[0] - here)))
+    return told[:_SHOWN]
 
 
 def _draw_ends(axes: Axes, run: Run) -> None:

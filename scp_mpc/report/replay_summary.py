@@ -47,6 +47,8 @@ def summarise_replay(run: Run) -> dict[str, Any]:
         "furthest_beside_m": float(np.abs(beside).max()),
         "slack_steps": int((slack > 1e-6).sum()),
         "max_slack_m": float(slack.max()),
+        "left_out_steps": sum(plan.left_out > 0 for plan in run.plans),
+        "most_left_out": max(plan.left_out for plan in run.plans),
         "median_ms": float(1e3 * np.median(run.seconds)),
         "p99_ms": float(1e3 * np.quantile(run.seconds, 0.99)),
         "max_ms": float(1e3 * run.seconds.max()),
@@ -84,6 +86,10 @@ def replay_table(numbers: dict[str, Any]) -> list[tuple[str, str]]:
         ("The same with nobody there [s]", _joined([n["pass_alone_s"]])),
         ("Furthest from the straight line [m]", f"{n['furthest_beside_m']:.2f}"),
         ("Steps with slack; largest [m]", f"{n['slack_steps']}; {n['max_slack_m']:.2f}"),
+        (
+            "Steps with people left out; at most",
+            f"{n['left_out_steps']}; {n['most_left_out']}",
+        ),
         (
             "Step, median; p99; max [ms]",
             _joined([n[f"{o}_ms"] for o in ("median", "p99", "max")], 1),

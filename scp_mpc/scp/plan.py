@@ -117,6 +117,7 @@ class Plan:
         iterate: The point with its multipliers, padded to all obstacle slots, at all nodes.
         history: With `Settings(history=True)`, what happened in each SCP iteration that led here.
         step: What it was made from.
+        left_out: Obstacles that nothing is promised about: there were more than slots for them.
     """
 
     X: FloatArray
@@ -135,6 +136,7 @@ class Plan:
     iterate: Iterate
     history: tuple[Record, ...]
     step: Step
+    left_out: int = 0
 
     @property
     def u0(self) -> FloatArray:

@@ -1,7 +1,8 @@
 """Coverage: how often people are where a tracker said that they would be.
 
-At each annotated frame the tracker is given what is seen, with noise, and predicts. An ellipse
-that is to hold a share q of the future positions is counted against where people went:
+At each annotated frame the tracker is given what is seen, with noise, and predicts who was measured
+twice at least: from a first sighting nobody knows where people go. An ellipse that is to hold a
+share q of the future positions is counted against where they went:
 
     e' Sigma^-1 e <= -2 log(1 - q)      (the chi-square quantile with two degrees of freedom)
 
@@ -17,7 +18,7 @@ Notation:
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -116,6 +117,8 @@ def measure_coverage(
     horizon = int(as_number("longest", longest) / dt + 1e-6) if dt else 0
     if horizon < 1:
         raise InvalidArgumentError("recording", f"no two frames within {longest} s")
+    settings = TrackerSettings() if settings is None else settings
+    settings = replace(settings, confirmations=max(settings.confirmations, 2))
     tracker = Tracker(dt, horizon, radius=0.0, measurement_std=noise, settings=settings)
     ahead = dt * np.arange(1, horizon + 1)
     whose, errors, covariances = [], [], []

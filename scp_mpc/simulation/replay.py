@@ -21,7 +21,6 @@ from scp_mpc.simulation.crossing import Crossing
 from scp_mpc.simulation.recording import Recording, along
 from scp_mpc.simulation.run import Run
 from scp_mpc.simulation.scene import Body, Scene
-from scp_mpc.simulation.sensor import nearest_first
 from scp_mpc.simulation.simulate import simulate
 from scp_mpc.simulation.there_and_back import ThereAndBack
 from scp_mpc.tracking.tracker import Tracker, TrackerSettings
@@ -49,14 +48,12 @@ def _place(times: FloatArray, positions: FloatArray, time: float) -> FloatArray:
 class RecordedSensor:
     """Measures people at the recording's own frames, with noise, and tracks them.
 
-    The robot is told of the nearest ones, as many as its problem has room for, and of its true
-    state.
+    The robot is told of all of them, and of its true state.
 
     Args:
         recording: Who walks where.
         noise: Standard deviation of each measured coordinate, which the tracker knows [m].
-        tracking: Of the tracker. With names nothing is a false alarm: by default people are told
-            of from their first measurement.
+        tracking: Of the tracker.
     """
 
     def __init__(
@@ -66,11 +63,11 @@ class RecordedSensor:
         require_positive("noise", noise)
         self._recording, self._noise = recording, noise
         self._times = recording.times - recording.times[0]
-        self._tracking = TrackerSettings(confirmations=1) if tracking is None else tracking
+        self._tracking = tracking
 
     def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
         """Begin a new run."""
-        self._problem, self._rng, self._frame = problem, rng, 0
+        self._rng, self._frame = rng, 0
         self._tracker = Tracker(
             problem.model.dt,
             problem.horizon,
@@ -92,8 +89,7 @@ class RecordedSensor:
             names = self._recording.names[self._frame].tolist()
             self._tracker.update(self._times[self._frame], measured, names)
             self._frame += 1
-        told = nearest_first(self._tracker.predictions(time), x[self._problem.model.position])
-        return x, told[: self._problem.max_obstacles]
+        return x, self._tracker.predictions(time)
 
 
 def replay_problem(
@@ -141,7 +137,7 @@ def replay(
         seed: Of the errors; the same one gives the same states.
         radius: Of each person [m].
         steps: Number of control steps K; as many as the recording has time for if None.
-        tracking: How people are tracked; see `RecordedSensor`.
+        tracking: How people are tracked.
         settings: How to solve the problem; without memory of obstacles, which the tracker has, if
             None.
         advance: Called after each step, for a progress bar.

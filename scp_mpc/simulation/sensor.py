@@ -53,8 +53,7 @@ class PerfectSensor:
 class TrackedSensor:
     """Measures where the bodies are, with errors, misses and outages, and tracks them.
 
-    Bodies with a shape are known from a map and do not move. At most as many are told of as the
-    problem has room for, those with a shape first, then the nearest.
+    Bodies with a shape are known from a map and do not move; they are told of first.
 
     Args:
         noise: Standard deviation of each measured coordinate, which the tracker knows [m].
@@ -87,7 +86,7 @@ class TrackedSensor:
             raise BoundsError("outage_rate", f"{outage_rate} is negative")
         self._noise, self._state_std, self._miss = noise, state_std, miss
         self._outage_rate, self._outage_time = outage_rate, outage_time
-        self._tracking = TrackerSettings(confirmations=1) if tracking is None else tracking
+        self._tracking = tracking
 
     def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
         """Begin a new run."""
@@ -108,8 +107,7 @@ class TrackedSensor:
         self, time: float, x: FloatArray, positions: FloatArray
     ) -> tuple[FloatArray, list[ObstaclePrediction]]:
         """See `Sensor`."""
-        rng, here = self._rng, x[self._problem.model.position]
-        y = x
+        rng, y = self._rng, x
         if self._state_std is not None:
             y = x + self._state_std * rng.standard_normal(len(x))
         if not self._moving.any():
@@ -123,10 +121,4 @@ class TrackedSensor:
                 self._blind_until = time + self._outage_time
             else:
                 self._tracker.update(time, measured[seen], who[seen].tolist())
-        told = nearest_first(self._tracker.predictions(time), here)
-        return y, [*self._walls, *told][: self._problem.max_obstacles]
-
-
-def nearest_first(told: list[ObstaclePrediction], here: FloatArray) -> list[ObstaclePrediction]:
-    """Return predictions in order of their distance now from a place (d,)."""
-    return sorted(told, key=lambda o: float(np.linalg.norm(o.means[0] - here) - o.radius))
+        return y, [*self._walls, *self._tracker.predictions(time)]

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from scp_mpc.arrays import (
+    BoolArray,
     FloatArray,
     IntArray,
     as_array,
@@ -36,6 +37,7 @@ from scp_mpc.tracking.motion import Motion
 from scp_mpc.tracking.prediction import HorizonPredictor
 
 _TICK = 1e-9  # [s]
+_LONGEST = 60.0  # [s] for which a silent sensor's tracks are moved on: then nothing is known
 
 WALKING = (Motion(density=0.007), Motion(density=0.11, weight=0.2))
 WALKING_AND_TURNING = (
@@ -66,11 +68,15 @@ class TrackerSettings:
             not known, several rates: their probabilities are estimated.
         dwell_time: Mean time [s] after which the motion is drawn anew, by the motions' weights.
         speed: Standard deviation [m/s] of each component of the velocity of which nothing is
-            known yet.
-        confirmations: Measurements after which a track is told of; the first one says nothing about
-            the velocity, so that predictions from it alone are as wide as `speed` makes them.
+            known yet: a first sighting says nothing about it, and is predicted as wide as that.
+        confirmations: Measurements after which a track is told of. Above 1, somebody seen for the
+            first time is a free road: only for sensors with so many false alarms that a robot
+            could not move among them.
         keep: Seconds without a measurement after which a track ends; longer than the sensor's usual
             outages, or all tracks begin anew after each, knowing nothing of velocities.
+        keep_new: The same for a track that was measured only once, which may be a false alarm.
+        silence: Seconds without any update after which the sensor is taken to be silent: see
+            `Tracker.healthy`. What it does not see from then on ends no track.
         gate: Probability that the right measurement is near enough to its track to be taken for
             it; where measurements have no names.
         std_inflation: Factor on the standard deviations of all predictions: for obstacles that are
@@ -80,8 +86,10 @@ class TrackerSettings:
     motions: tuple[Motion, ...] = WALKING
     dwell_time: float = 1.3
     speed: float = 1.0
-    confirmations: int = 2
+    confirmations: int = 1
     keep: float = 1.5
+    keep_new: float = 0.5
+    silence: float = 1.0
     gate: float = 0.999
     std_inflation: float = 1.0
 
@@ -92,11 +100,12 @@ class TrackerSettings:
         for k, motion in enumerate(self.motions):
             if not isinstance(motion, Motion):
                 raise InvalidArgumentError(f"motions[{k}]", f"{motion!r} is not a Motion")
-        for name in ("dwell_time", "speed", "std_inflation"):
+        for name in ("dwell_time", "speed", "std_inflation", "silence"):
             require_positive(name, getattr(self, name))
         as_count("confirmations", self.confirmations)
-        if as_number("keep", self.keep) < 0:
-            raise BoundsError("keep", f"{self.keep} s is negative")
+        for name in ("keep", "keep_new"):
+            if as_number(name, getattr(self, name)) < 0:
+                raise BoundsError(name, f"{getattr(self, name)} s is negative")
         if not 0 < as_number("gate", self.gate) < 1:
             raise BoundsError("gate", f"{self.gate} is not between 0 and 1")
 
@@ -139,6 +148,8 @@ class Tracker:
 
     A track that is not measured goes on by itself for `settings.keep` seconds. So the controller
     need not keep vanished obstacles as well: `Settings(staleness=StalenessPolicy(keep=0))`.
+    A sensor that sees nobody says so by an update with no positions; one that says nothing is
+    silent: tracks go on growing then, for as long as it takes, and `healthy` is false.
 
     Args:
         dt: Interval of the predictions [s], the robot's.
@@ -197,6 +208,15 @@ class Tracker:
         """Names of all tracks as of the last update, the unconfirmed ones among them."""
         return self._tracks.names
 
+    def healthy(self, time: float) -> bool:
+        """Whether the last update is at most `settings.silence` seconds old at a time [s].
+
+        False before the first one, too. Predictions of a silent sensor know of nobody new: a robot
+        should stand still among them.
+        """
+        now = as_number("time", time)
+        return self._time is not None and now - self._time <= self.settings.silence + _TICK
+
     def estimates(self) -> Gaussians:
         """States [p, v] as of the last update, in the order of `names`: (n, 2 d), (n, 2 d, 2 d)."""
         return self._tracks.beliefs.moments()
@@ -240,6 +260,7 @@ class Tracker:
             called = tuple(given[k] for k in fresh)
         later = self._corrected(tracks, old, z[new], R[new], now)
         later = later.joined(self._begun(called, z[fresh], R[fresh], now))
+        later = later.at(np.flatnonzero(self._lasting(later, now)))
         self._time, self._named, self._tracks = now, given is not None, later
         self._born += len(fresh)
         whose = dict(zip(new, (tracks.names[i] for i in old), strict=True))
@@ -250,7 +271,8 @@ class Tracker:
         """Return what is predicted of each confirmed track, stamped and named.
 
         Row 0 is at `time`, with all that is known by then: tracks that were not measured of late
-        are moved on, and less certain for it, until they end.
+        are moved on, and less certain for it, until they end. An empty list before the first
+        update says nothing: see `healthy`.
 
         Args:
             time: Of row 0 [s]; that of the last update if None.
@@ -287,12 +309,22 @@ class Tracker:
         return np.broadcast_to(R, (count, d, d))
 
     def _moved(self, now: float) -> _Tracks:
-        """The tracks that have not ended by then, moved on without measurements."""
-        alive = np.flatnonzero(now - self._tracks.seen <= self.settings.keep + _TICK)
-        tracks = self._tracks.at(alive)
-        if self._time is None or now == self._time or not tracks.names:
+        """The tracks that have not ended by then, moved on without measurements.
+
+        Whoever the last update saw was not missed since, and nobody is by a silent sensor.
+        """
+        last, tracks = self._time, self._tracks
+        if last is None or now == last or not tracks.names:
             return tracks
-        return tracks._replace(beliefs=self._bank.predict(tracks.beliefs, now - self._time))
+        lasting = self._lasting(tracks, min(now, last + self.settings.silence))
+        tracks = tracks.at(np.flatnonzero(lasting | (tracks.seen == last)))
+        age = min(now - last, _LONGEST)
+        return tracks._replace(beliefs=self._bank.predict(tracks.beliefs, age))
+
+    def _lasting(self, tracks: _Tracks, now: float) -> BoolArray:
+        """Which tracks were measured lately enough."""
+        keep = np.where(tracks.hits > 1, self.settings.keep, self.settings.keep_new)
+        return np.asarray(now - tracks.seen <= keep + _TICK)
 
     def _pairs(
         self, tracks: _Tracks, z: FloatArray, R: FloatArray, given: tuple[Hashable, ...] | None

@@ -39,7 +39,12 @@ BAD = [
         StaleDataError,
         r"\[0\].stamp: 10.5 s is 0.3",
     ),
-    ({"obstacles": [seen(stamp=1.8e9)]}, StaleDataError, "ahead of this step's time 10.2 s"),
+    (
+        {"obstacles": [seen(stamp=1.8e9)], "time": 10.2},
+        StaleDataError,
+        "ahead of this step's time 10.2 s",
+    ),
+    ({"obstacles": [seen(stamp=10.2)]}, StaleDataError, "time: missing, but a step before"),
     ({"obstacles": [seen(name=1), seen(name=1)]}, InvalidArgumentError, r"\[1\].name: 1 is given"),
     ({"obstacles": seen(name=1)}, InvalidArgumentError, "obstacles"),
     ({"obstacles": [seen(name=1), None]}, InvalidArgumentError, r"obstacles\[1\]: None"),
@@ -73,10 +78,12 @@ def test_a_solver_that_fails_leaves_no_trace(monkeypatch):
 
 def test_the_same_time_twice_and_a_little_ahead_are_fine():
     mpc = controller()
-    for stamp in (10.0, 10.25):
-        report = seen(stamp=stamp)
+    report = seen(stamp=10.0)
+    for _ in range(2):
         step(mpc, report, time=10.0)
         assert mpc.obstacles == (report,)
+    step(mpc, seen(stamp=10.25), time=10.0)
+    np.testing.assert_allclose(mpc.obstacles[0].means[0], report.means[0] - [0.25 * 0.3, 0.0])
 
 
 def test_stamps_may_be_required():
@@ -207,7 +214,7 @@ def test_bad_freshness_is_refused(values, message):
 
 
 def test_recalling_changes_nothing_before_it_is_committed():
-    memory = ObstacleMemory(StalenessPolicy(), DT, 3)
+    memory = ObstacleMemory(StalenessPolicy(), DT)
     report = ObstaclePrediction(np.zeros((N + 1, 2)), np.eye(2), 0.2, stamp=1.0, name="a")
     recall = memory.recall(1.0, [report])
     assert memory.recall(0.0, []).obstacles == ()

@@ -10,14 +10,19 @@ from instances import DT, obstacle, straight_reference
 from watching import NAN, controller, seen, state, step
 
 from scp_mpc import (
+    MPC,
+    DoubleIntegrator,
     NotFiniteError,
+    ObstaclePrediction,
+    Problem,
     ShapeError,
     StaleDataError,
     StalenessPolicy,
     Status,
-    TooManyObstaclesError,
 )
 from scp_mpc.obstacles import propagated
+
+WEAK = {"u_min": -1.0, "u_max": 1.0}
 
 # Vanished obstacles
 
@@ -82,22 +87,19 @@ def test_unnamed_obstacles_are_not_kept():
     assert mpc.obstacles == ()
 
 
-def test_those_given_come_first_and_the_oldest_kept_are_left_out(caplog):
+def test_those_given_come_first_and_the_farthest_are_left_out(caplog):
     mpc = controller(slots=2, keep=5.0)
     step(mpc, seen(name="a"), seen(name="b", at=(9.0, 9.0)))
-    step(mpc, seen(name="b", at=(9.0, 9.0)))
+    assert step(mpc, seen(name="b", at=(9.0, 9.0))).left_out == 0
     assert [o.name for o in mpc.obstacles] == ["b", "a"]
     assert not caplog.records
-    step(mpc, seen(name="c", at=(9.0, -9.0)))
-    assert [o.name for o in mpc.obstacles] == ["c", "b"]
+    assert step(mpc, seen(name="c", at=(6.0, -6.0))).left_out == 1
+    assert [o.name for o in mpc.obstacles] == ["c", "a"]
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
-    assert "room for 1" in record.getMessage()
-    # There is room again, and "a" was heard of 0.6 s ago.
-    step(mpc)
-    assert [o.name for o in mpc.obstacles] == ["c", "b"]
-    with pytest.raises(TooManyObstaclesError):
-        step(mpc, *(seen(name=i) for i in range(3)))
+    assert "3 obstacles, but max_obstacles = 2" in record.getMessage()
+    assert step(mpc).left_out == 1  # "b" is kept, and left out again
+    assert len(caplog.records) == 1
 
 
 # Late reports
@@ -131,8 +133,70 @@ def test_without_a_given_time_the_clock_runs_by_intervals():
         step(mpc, seen(stamp=0.0))
         assert mpc.obstacles[0].means[0, 0] == pytest.approx(3.0 + 0.3 * DT * k)
     step(mpc, seen(stamp=20.0), time=20.0)
-    step(mpc, seen(stamp=20.0))
-    assert mpc.obstacles[0].stamp == pytest.approx(20.2)
+    with pytest.raises(StaleDataError, match="time: missing, but a step before had one"):
+        step(mpc, seen(stamp=20.2))
+    step(mpc, seen(name="a"))  # without a stamp: of now
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2, 1.0])
+@pytest.mark.parametrize("rate", [0.5, 0.9, 1.5, 3.0])
+def test_stamps_of_another_clock_are_refused_without_a_time(dt, rate):
+    """Called at another rate than once in an interval: found before it makes a difference."""
+    given = {"max_obstacles": 1, "nodes_per_interval": 1}
+    mpc = MPC(Problem(DoubleIntegrator(dt), horizon=3, Q=np.ones(4), R=np.ones(2), **WEAK, **given))
+    means = np.tile([9.0, 0.0], (4, 1))
+    for k in range(60):
+        there = ObstaclePrediction(means, np.eye(2), 0.2, stamp=rate * dt * k)
+        if abs(rate - 1) * dt * k > 0.05 + 1e-5:
+            with pytest.raises(StaleDataError, match=rf"time: missing.*steps of {dt:g} s"):
+                mpc.step(np.zeros(4), np.zeros(4), [there])
+            break
+        mpc.step(np.zeros(4), np.zeros(4), [there])
+    else:
+        raise AssertionError("believed for ever")
+    mpc.reset()
+    for k in range(5):  # the same with times is fine, and so is the right rate
+        there = ObstaclePrediction(means, np.eye(2), 0.2, stamp=rate * dt * k)
+        mpc.step(np.zeros(4), np.zeros(4), [there], time=rate * dt * k)
+    mpc.reset()
+    for k in range(60):
+        there = ObstaclePrediction(means, np.eye(2), 0.2, stamp=dt * k)
+        mpc.step(np.zeros(4), np.zeros(4), [there])
+        assert mpc.obstacles == (there,)
+
+
+def test_stamps_ahead_of_the_clock_that_counts_steps_are_refused():
+    for stamp in (DT, 0.1, 100.0):
+        with pytest.raises(StaleDataError, match="off the clock that counts steps"):
+            step(controller(), seen(stamp=stamp))
+
+
+@pytest.mark.parametrize("ahead", [0.01, 0.05, 0.1, 0.24])
+def test_stamps_of_the_future_are_moved_back_to_now(ahead):
+    """As much as they are ahead; nothing becomes surer."""
+    mpc, report = controller(), seen(stamp=10.0 + ahead, velocity=(2.0, 0.5))
+    step(mpc, report, time=10.0)
+    (used,) = mpc.obstacles
+    np.testing.assert_allclose(used.means, report.means - ahead * np.array([2.0, 0.5]), atol=1e-12)
+    np.testing.assert_array_equal(used.covariances[0], report.covariances[0])
+    share = ahead / DT - np.floor(ahead / DT)
+    first = int(np.floor(ahead / DT))
+    older = share * report.covariances[1] + (1 - share) * report.covariances[2]
+    np.testing.assert_allclose(used.covariances[2 + first], older, atol=1e-12)
+    assert used.stamp == pytest.approx(10.0)
+
+
+def test_a_clock_that_jumps_ahead_forgets_who_vanished_and_brakes_for_old_reports():
+    mpc = controller()
+    step(mpc, seen(stamp=10.0, name="a"), time=10.0)
+    assert step(mpc, seen(stamp=10.2, name="a"), time=1e6).status is Status.STALE
+    plan = step(mpc, seen(stamp=1e6, name="b"), time=1e6 + DT)
+    assert [o.name for o in mpc.obstacles] == ["b"]
+    assert plan.ok
+    with pytest.raises(StaleDataError, match=r"time: 10.6 s is before .* reset\(\) forgets that"):
+        step(mpc, seen(stamp=10.6), time=10.6)
+    mpc.reset()
+    assert step(mpc, seen(stamp=10.6), time=10.6).ok
 
 
 @pytest.mark.parametrize("epoch", [0.0, 1.8e9])
@@ -193,7 +257,6 @@ def test_an_absurdly_old_report_brakes_too():
         ({"x0": [0, 0, NAN, 0]}, NotFiniteError),
         ({"x_ref": np.zeros(3)}, ShapeError),
         ({"obstacles": [replace(obstacle(N + 1, (1, 0)), stamp=0.0, name=1)]}, ShapeError),
-        ({"obstacles": [seen(stamp=0.0, name=j) for j in range(2)]}, TooManyObstaclesError),
     ],
 )
 def test_bad_arguments_are_refused_before_braking(change, error):

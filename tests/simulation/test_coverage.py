@@ -52,12 +52,15 @@ def test_overconfidence_shows(model):
         assert row.shares[2] < 0.8
 
 
+TWICE = TrackerSettings(confirmations=2)
+
+
 def test_counts_are_those_of_a_loop():
     """One lead time, with explicit loops over frames and people."""
     recording, noise, lead = street(), 0.1, 5
     found = measure_coverage(recording, noise=noise, seed=3).leads[lead - 1]
     rng = np.random.default_rng(3)
-    tracker = Tracker(recording.interval, 12, radius=0, measurement_std=noise)
+    tracker = Tracker(recording.interval, 12, radius=0, measurement_std=noise, settings=TWICE)
     squares, errors = [], []
     for k, (names, places) in enumerate(zip(recording.names, recording.positions, strict=True)):
         measured = places + noise * rng.standard_normal(places.shape)

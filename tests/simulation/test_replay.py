@@ -79,15 +79,19 @@ def test_the_tracker_gets_noisy_measurements_as_they_come(run):
     assert np.array_equal(new.states, run.states[:33])
 
 
-def test_the_nearest_are_told_of():
+def test_all_are_told_of_and_who_is_left_out_is_counted():
     problem = replay_problem(horizon=5, max_obstacles=2)
     run = replay(street(people=5, frames=20), Crossing([0, -5], [0, 5]), problem)
-    for told, x, bodies in zip(run.predictions, run.positions, run.bodies, strict=False):
-        distances = np.linalg.norm(bodies - x, axis=1)
-        there = np.flatnonzero(~np.isnan(distances))
-        assert len(told) == min(2, len(there))
-        furthest = max(distances[o.name] for o in told)
-        assert (distances[there] < furthest - 0.3).sum() < 2
+    for told, plan, bodies in zip(run.predictions, run.plans, run.bodies, strict=False):
+        there = np.flatnonzero(~np.isnan(bodies[:, 0]))
+        assert {o.name for o in told} == set(there.tolist())
+        assert plan.left_out == max(len(there) - 2, 0)
+    numbers = summarise_replay(run)
+    left_out = [plan.left_out for plan in run.plans]
+    assert numbers["left_out_steps"] == np.count_nonzero(left_out) > 0
+    assert numbers["most_left_out"] == max(left_out) == 3
+    words = f"{np.count_nonzero(left_out)}; 3"
+    assert dict(replay_table(numbers))["Steps with people left out; at most"] == words
 
 
 def test_a_robot_with_a_nose():

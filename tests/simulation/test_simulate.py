@@ -90,15 +90,16 @@ def test_same_seed_same_run_and_the_sensor_is_noisy():
     assert one.seed == 1
 
 
-def test_walls_come_first_and_the_nearest_next():
+def test_walls_come_first_and_who_is_left_out_is_counted():
     problem = Problem(
         DoubleIntegrator(0.1), horizon=5, Q=np.ones(4), R=np.ones(2), u_min=-1, u_max=1,
         max_obstacles=2,
     )  # fmt: skip
     run = simulate(MPC(problem), SCENE, sensor=TrackedSensor(), steps=15)
-    for told in run.predictions[1:]:
-        assert [o.shape is not None for o in told] == [True, False]
-    assert run.predictions[-1][1].name == 2  # 2.2 m away, the walker 4
+    for told, plan in zip(run.predictions, run.plans, strict=True):
+        assert [o.shape is not None for o in told] == [True, False, False][: len(told)]
+        assert plan.left_out == len(told) - 2
+        assert plan.step.count == 2
 
 
 def test_an_outage_leaves_the_tracks_alone():

@@ -14,7 +14,7 @@ from scp_mpc.errors import (
 )
 from scp_mpc.tracking import WALKING_AND_TURNING, Motion, Tracker, TrackerSettings
 
-CERTAIN = TrackerSettings(confirmations=1)
+CONFIRMED = TrackerSettings(confirmations=2)
 
 
 def tracker(settings=None, **changes):
@@ -53,7 +53,7 @@ def test_predictions_later_are_the_same_ones_moved_on():
 
 
 def test_dropouts_cost_certainty_and_tracks_end():
-    follower = tracker(CERTAIN)
+    follower = tracker()
     for k in range(5):
         follower.update(0.2 * k, [[0.2 * k, 0], [0, 5]], ["a", "b"])
     follower.update(1.0, [[1.0, 0]], ["a"])
@@ -66,6 +66,90 @@ def test_dropouts_cost_certainty_and_tracks_end():
     assert follower.names == ("a",)
     follower.update(2.6, [[0, 5]], ["b"])
     assert follower.predictions()[1].largest_std[-1] > 1.0  # b begins anew: its speed is not known
+
+
+def test_a_first_sighting_is_told_of_as_wide_as_it_is():
+    """Nothing is known of the velocity but how fast people walk."""
+    settings = TrackerSettings(motions=(Motion(1e-9),), speed=0.7)
+    follower = tracker(settings)
+    follower.update(0.0, [[0.9, 0.0]])
+    (told,) = follower.predictions()
+    np.testing.assert_allclose(told.means, np.tile([0.9, 0.0], (11, 1)), atol=1e-12)
+    std = np.sqrt(0.05**2 + (0.7 * 0.2 * np.arange(11)) ** 2)
+    np.testing.assert_allclose(told.largest_std, std, rtol=1e-6)
+    assert follower.healthy(0.0)
+
+
+@pytest.mark.parametrize(("dt", "nodes"), [(0.01, 1), (0.1, 4), (1.0, 4)])
+def test_a_robot_does_not_run_into_a_first_sighting(dt, nodes):
+    """One measurement 0.9 m ahead of a robot at 1 m/s; then the sensor is silent for a second."""
+    problem = Problem(
+        DoubleIntegrator(dt), horizon=20, Q=[1, 0.1, 1, 0.1], R=[0.1, 0.1], u_min=-2, u_max=2,
+        robot_radius=0.3, nodes_per_interval=nodes,
+    )  # fmt: skip
+    follower, x = Tracker(dt, 20, radius=0.3, measurement_std=0.05), np.array([0.0, 1.0, 0.0, 0.0])
+    follower.update(0.0, [[0.9, 0.0]])
+    mpc = MPC(problem, Settings(deadline=None))
+    for k in range(3):
+        plan = mpc.step(x, [9.0, 0, 0, 0], follower.predictions(k * dt), time=k * dt)
+        assert not (plan.ok and plan.u0[0] > 1.9)
+        assert plan.step.count == 1
+        x = problem.model.step(x, plan.u0)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.1, 1.0])
+def test_a_silent_sensor_is_told_of_and_its_tracks_go_on_growing(dt):
+    follower = tracker(dt=dt)
+    assert not follower.healthy(0.0)
+    for k in range(5):
+        follower.update(0.1 * k, [[0.1 * k, 0.0], [3.0, 3.0]][: 2 - k % 2])  # missed at times
+    follower.update(0.5, [[0.5, 0.0], [-4.0, 0.0]])  # and one is new
+    widths = []
+    for silent in (0.0, 0.3, 0.9, 1.0, 1.6, 5.0, 59.0, 1e9):
+        told = follower.predictions(0.5 + silent)
+        assert len(told) == 3
+        assert follower.healthy(0.5 + silent) == (silent <= 1.0)
+        widths.append([o.largest_std[0] for o in told])
+        assert all(o.stamp == 0.5 + silent for o in told)
+    assert (np.diff(widths, axis=0) > 0).all()
+    assert np.isfinite(follower.predictions(1e9)[0].covariances).all()
+    assert follower.update(7.0, [[7.0, 0.0]]) == (0,)  # it comes back: who is there is known again
+    assert follower.names == (0,)
+    assert follower.healthy(7.0)
+
+
+def test_who_was_missed_long_before_the_silence_ends():
+    follower = tracker()
+    for k in range(13):
+        seen = 2 if k < 2 else 1
+        follower.update(0.1 * k, [[0.0, 0.0], [5.0, 0.0]][:seen], ["a", "b"][:seen])
+    assert [o.name for o in follower.predictions(1.59)] == ["a", "b"]
+    assert [o.name for o in follower.predictions(1.61)] == ["a"]
+
+
+def test_a_false_alarm_does_not_keep_the_robot_for_long():
+    follower = tracker()
+    for k in range(4):
+        follower.update(0.1 * k, [[0.0, 0.0]])
+    follower.update(0.4, [[0.0, 0.0], [2.0, 0.0]])
+    for k, told in ((5, 2), (9, 2), (10, 1)):
+        follower.update(0.1 * k, [[0.0, 0.0]])
+        assert len(follower.predictions()) == told
+
+
+@pytest.mark.parametrize("jump", [10.0, 1e4, 1e9])
+def test_a_clock_that_jumps_ahead_is_survived_and_one_that_goes_back_refused(jump):
+    follower = tracker()
+    for t in (0.0, 0.2, 0.4):
+        follower.update(t, [[t, 0.0], [5.0, t]], ["a", "b"])
+    follower.update(jump, [[1.0, 0.0]], ["a"])
+    (told,) = follower.predictions()
+    np.testing.assert_allclose(told.means[0], [1.0, 0.0], atol=0.01)
+    ObstaclePrediction(told.means, told.covariances, told.radius)
+    with pytest.raises(StaleDataError, match="is not after"):
+        follower.update(0.6, [[0.6, 0.0]], ["a"])
+    follower.reset()
+    follower.update(0.6, [[0.6, 0.0]], ["a"])
 
 
 def test_tracks_are_told_of_once_confirmed():
@@ -92,7 +176,7 @@ def test_measurements_without_names_are_paired():
 
 
 def test_what_is_beyond_the_gate_begins_a_new_track():
-    follower = tracker()
+    follower = tracker(CONFIRMED)
     for k in range(4):
         assert follower.update(0.2 * k, [[0.0, 0.0]]) == (0,)
     assert follower.update(0.8, [[3.0, 0.0], [0.02, 0.0]]) == (1, 0)
@@ -231,6 +315,8 @@ def test_bad_trackers_are_refused(changes, error):
         ({"speed": -1.0}, BoundsError),
         ({"confirmations": 0}, BoundsError),
         ({"keep": -1.0}, BoundsError),
+        ({"keep_new": -1.0}, BoundsError),
+        ({"silence": 0.0}, BoundsError),
         ({"gate": 1.0}, BoundsError),
         ({"std_inflation": float("nan")}, NotFiniteError),
     ],
