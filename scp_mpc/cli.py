@@ -120,7 +120,7 @@ _File = Annotated[
 ]
 _Rate = Annotated[
     float | None,
-    typer.Option(help="Frame numbers per second; 25, or what makes text's frames 0.4 s apart."),
+    typer.Option(help="Frame numbers per second; an obsmat's velocities tell it if not given."),
 ]
 _Layout = Annotated[
     str | None, typer.Option(help='"obsmat" or "text"; told from the columns if not given.')

@@ -113,6 +113,7 @@ def measure_coverage(
     for level in levels:
         if not 0 < as_number("levels", level) < 1:
             raise BoundsError("levels", f"{level} is not between 0 and 1")
+    recording.require_plausible()
     dt, rng = recording.interval, np.random.default_rng(seed)
     horizon = int(as_number("longest", longest) / dt + 1e-6) if dt else 0
     if horizon < 1:

@@ -9,6 +9,7 @@ from scp_mpc.arrays import FloatArray, IntArray, frozen
 from scp_mpc.errors import InvalidArgumentError
 
 _TICK = 1e-6  # [s]; sums of intervals are no more exact than that
+_FASTEST, _SLOWEST = 22.0, 0.01  # [m/s] that the upper quartile, and nearly all speeds, are within
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,31 @@ class Recording:
         t, p = frozen(t[order]), frozen(p[order])
         pieces = zip(np.split(t, first[1:]), np.split(p, first[1:]), strict=True)
         return {int(name): piece for name, piece in zip(people, pieces, strict=True)}
+
+    def require_plausible(self) -> None:
+        """Check that people move as fast as people, or vehicles among them, at most.
+
+        Raises:
+            InvalidArgumentError: A quarter of all speeds from one annotation to the next is beyond
+                22 m/s, or nearly all are below 0.01 m/s and not zero: other units than metres, or
+                another rate. It names the speed.
+        """
+        ways = [
+            (np.diff(t), np.linalg.norm(np.diff(p, axis=0), axis=1)) for t, p in self.paths.values()
+        ]
+        speeds = np.concatenate([way / time for time, way in ways])
+        if not speeds.size:
+            return
+        high, most = np.quantile(speeds, [0.75, 0.95])
+        if high > _FASTEST:
+            raise InvalidArgumentError(
+                "recording",
+                f"a quarter of the speeds is beyond {high:.3g} m/s: positions in metres? rate?",
+            )
+        if 0 < most < _SLOWEST:
+            raise InvalidArgumentError(
+                "recording", f"nobody is faster than {most:.2g} m/s: positions in metres? rate?"
+            )
 
 
 def along(times: FloatArray, positions: FloatArray, wanted: FloatArray | float) -> FloatArray:

@@ -5,8 +5,13 @@
 
 Numbers between any white space, one row per person and annotated frame, in any order. Empty
 lines and lines that begin with # are skipped.
+
+Neither format says how many frames make a second. The velocities v of obsmat tell it: with the
+way d from one annotated frame of a person to the next, k frame numbers later, the rate is
+k |v|^2 / v'd.
 """
 
+import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,18 +26,27 @@ from scp_mpc.simulation.recording import Recording
 
 Layout = Literal["obsmat", "text"]
 
-_FRAMES_PER_SECOND = 25.0  # of the videos behind obsmat.txt
-_ANNOTATIONS_PER_SECOND = 2.5  # of trajnet's, however its frames are numbered
+_log = logging.getLogger(__name__)
+
+_SCATTER = 0.3  # between the quartiles of the rates that a file's rows tell, relative to the median
+_USUAL = np.array(
+    [1, 2, 2.5, 3, 4, 5, 6, 7.5, 8, 10, 12, 12.5, 15, 20, 24, 25, 30, 50, 60, 100, 120]
+)
+_NEAR = 0.03  # relative distance from a usual rate at which one is taken for it
+_OTHER = 0.1  # relative difference of a given rate from the told one that is worth a warning
 _LONGEST = 60  # characters of an offending line that an error shows
 
 
 class _Columns(NamedTuple):
     number: int
-    x: int
-    y: int
+    position: tuple[int, int]
+    velocity: tuple[int, int] | tuple[()]
 
 
-_LAYOUTS: dict[str, _Columns] = {"obsmat": _Columns(8, 2, 4), "text": _Columns(4, 2, 3)}
+_LAYOUTS: dict[str, _Columns] = {
+    "obsmat": _Columns(8, (2, 4), (5, 7)),
+    "text": _Columns(4, (2, 3), ()),
+}
 
 
 class RecordingError(InvalidArgumentError):
@@ -58,14 +72,14 @@ def read_recording(
 
     Args:
         file: Text in one of the formats above.
-        rate: Frame numbers per second. None: 25 for obsmat; for text, whatever makes annotated
-            frames 0.4 s apart, as they are 1, 6 or 10 numbers apart in different files.
+        rate: Frame numbers per second; None for what an obsmat's own velocities tell.
         layout: Which format it is; told from the number of columns if None. Where it is given,
             rows may have further columns.
 
     Raises:
         RecordingError: A line that cannot be read, or somebody twice in a frame.
-        InvalidArgumentError: The rate is not positive or the layout unknown.
+        InvalidArgumentError: The rate is not positive, or neither given nor told by the file; the
+            layout is unknown; speeds are not those of people, see `Recording.require_plausible`.
         OSError: There is no such file.
     """
     path = Path(file)
@@ -81,15 +95,22 @@ def read_recording(
             columns = _told_by(path, number, text, len(row))
         _check(path, number, text, row, columns, exact=layout is None)
         lines.append(number)
-        rows.append([row[0], row[1], row[columns.x], row[columns.y]])
+        rows.append([row[0], row[1], *(row[k] for k in columns.position + columns.velocity)])
     if columns is None or not rows:
         raise RecordingError(path, "holds no rows")
     table = np.array(rows)
     _require_once(path, lines, table)
-    if rate is None:
-        obsmat = columns is _LAYOUTS["obsmat"]
-        rate = _FRAMES_PER_SECOND if obsmat else _ANNOTATIONS_PER_SECOND * _step(table[:, 0])
-    return Recording.from_rows(table[:, 0] / rate, table[:, 1].astype(np.intp), table[:, 2:])
+    told = _told_rate(table) if columns.velocity else None
+    if rate is None and told is None:
+        raise InvalidArgumentError(
+            "rate", f"missing: {path.name} does not tell how many frame numbers make a second"
+        )
+    if rate is not None and told is not None and abs(rate - told) > _OTHER * told:
+        _log.warning("%s: rate %g is given, but its velocities tell %.3g", path.name, rate, told)
+    times = table[:, 0] / (told if rate is None else rate)
+    recording = Recording.from_rows(times, table[:, 1].astype(np.intp), table[:, 2:4])
+    recording.require_plausible()
+    return recording
 
 
 def _rows(path: Path) -> Iterator[tuple[int, str, list[float]]]:
@@ -140,7 +161,18 @@ def _require_once(path: Path, lines: list[int], table: FloatArray) -> None:
             raise RecordingError(path, problem, line, f"{frame:g} {name:g}")
 
 
-def _step(frames: FloatArray) -> float:
-    """Usual number of frames from one annotated frame to the next; 1 if there is but one."""
-    steps, counts = np.unique(np.diff(np.unique(frames)), return_counts=True)
-    return float(steps[counts.argmax()]) if len(steps) else 1.0
+def _told_rate(table: FloatArray) -> float | None:
+    """Frame numbers per second by the velocities of rows (n, 6); None where they do not tell."""
+    table = table[np.lexsort((table[:, 0], table[:, 1]))]
+    frames, who, p, v = table[:, 0], table[:, 1], table[:, 2:4], table[:, 4:]
+    same = np.diff(who) == 0
+    k, d, v = np.diff(frames)[same], np.diff(p, axis=0)[same], (v[1:] + v[:-1])[same] / 2
+    speed2, along = (v * v).sum(axis=1), (v * d).sum(axis=1)
+    if not (along > 0).any():
+        return None
+    fast = (speed2 >= np.median(speed2[along > 0])) & (along != 0)
+    low, rate, high = np.quantile(k[fast] * speed2[fast] / along[fast], [0.25, 0.5, 0.75])
+    if rate <= 0 or high - low > _SCATTER * rate:
+        return None
+    usual = float(_USUAL[np.abs(_USUAL - rate).argmin()])
+    return usual if abs(rate - usual) <= _NEAR * usual else float(rate)

@@ -145,6 +145,7 @@ def replay(
     Raises:
         InvalidArgumentError: Or one of its subclasses.
     """
+    recording.require_plausible()
     crossing = Crossing.through(recording, "along") if crossing is None else crossing
     problem = replay_problem() if problem is None else problem
     if settings is None:

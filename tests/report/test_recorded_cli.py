@@ -80,7 +80,8 @@ def test_replay_passes_its_options_on(file, tmp_path):
         (["replay", "--speed", -1], "speed: -1"),
         (["replay", "--layout", "csv"], "layout: 'csv'"),
         (["coverage", "--rate", -1], "rate: -1"),
-        (["coverage", "--layout", "text", "--noise", "nan"], "noise: nan"),
+        (["coverage", "--layout", "text", "--rate", 25, "--noise", "nan"], "noise: nan"),
+        (["coverage", "--layout", "text"], "rate: missing: obsmat.txt does not tell"),
         (["coverage", "--std-inflation", 0], "std_inflation: 0"),
     ],
 )

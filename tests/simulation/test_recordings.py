@@ -2,10 +2,18 @@
 
 import numpy as np
 import pytest
+from recordings import rows as street_rows
 from recordings import street, write_obsmat, write_text
 
 from scp_mpc.errors import BoundsError, InvalidArgumentError
-from scp_mpc.simulation import Recording, RecordingError, read_recording, recorded_people
+from scp_mpc.simulation import (
+    Recording,
+    RecordingError,
+    measure_coverage,
+    read_recording,
+    recorded_people,
+    replay,
+)
 
 
 def assert_same(read, made):
@@ -28,7 +36,8 @@ def test_obsmat(tmp_path):
 @pytest.mark.parametrize("between", [" ", "\t", "  \t "])
 def test_text_of_any_step(tmp_path, step, between):
     made = street()
-    assert_same(read_recording(write_text(made, tmp_path / "crowd.txt", step, between)), made)
+    file = write_text(made, tmp_path / "crowd.txt", step, between)
+    assert_same(read_recording(file, rate=step / 0.4), made)
 
 
 def test_the_rate_is_of_frame_numbers(tmp_path):
@@ -37,13 +46,75 @@ def test_the_rate_is_of_frame_numbers(tmp_path):
     assert read_recording(file, rate=15.0).interval == pytest.approx(0.4)
     assert read_recording(file, rate=30.0).interval == pytest.approx(0.2)
     file = write_obsmat(made, tmp_path / "obsmat.txt", step=6)
-    assert read_recording(str(file)).interval == pytest.approx(6 / 25)
+    assert read_recording(str(file)).interval == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("interval", "step"), [(0.4, 10), (0.4, 6), (0.1, 1), (0.04, 1), (1.0, 5)])
+def test_the_velocities_tell_the_rate(tmp_path, interval, step, caplog):
+    """25, 15, 10, 25 and 5 per second; a given one that is another one is warned of."""
+    made = street(interval=interval)
+    file = write_obsmat(made, tmp_path / "obsmat.txt", step)
+    assert_same(read_recording(file), made)
+    assert_same(read_recording(file, rate=step / interval), made)
+    assert not caplog.records
+    assert read_recording(file, rate=2.0).interval == pytest.approx(step / 2)
+    (record,) = caplog.records
+    assert f"rate 2 is given, but its velocities tell {step / interval:g}" in record.getMessage()
+
+
+def test_noise_on_the_positions_moves_no_rate(tmp_path):
+    made, rng = street(people=12), np.random.default_rng(0)
+    rows = write_obsmat(made, tmp_path / "obsmat.txt", 6).read_text().splitlines()[2:]
+    table = np.array([[float(word) for word in row.split()] for row in rows])
+    table[:, [2, 4]] += rng.normal(0, 0.03, (len(table), 2))
+    np.savetxt(tmp_path / "noisy.txt", table)
+    assert read_recording(tmp_path / "noisy.txt").interval == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("spoilt", ["text", "zeros", "random", "backwards"])
+def test_a_rate_that_nothing_tells_must_be_given(tmp_path, spoilt):
+    made, file = street(), tmp_path / "crowd.txt"
+    if spoilt == "text":
+        write_text(made, file)
+    elif spoilt == "random":
+        rows = np.array([[f, n, x, 0, y, 0, 0, 0] for f, n, x, y in street_rows(made, 10)])
+        rows[:, [5, 7]] = np.random.default_rng(0).normal(size=(len(rows), 2))
+        np.savetxt(file, rows)
+    else:
+        write_obsmat(made, file, scale=0.0 if spoilt == "zeros" else -1.0)
+    with pytest.raises(InvalidArgumentError, match=r"rate: missing: crowd\.txt does not tell"):
+        read_recording(file)
+    assert_same(read_recording(file, rate=25.0), made)
+
+
+@pytest.mark.parametrize(("scale", "words"), [(40.0, "beyond"), (1e3, "beyond"), (1e-3, "faster")])
+def test_other_units_are_refused_with_the_speed(tmp_path, scale, words):
+    """Pixels, millimetres, kilometres."""
+    made = street()
+    scaled = Recording(made.times, made.names, tuple(scale * p for p in made.positions))
+    file = write_obsmat(scaled, tmp_path / "obsmat.txt")
+    for refuse in (
+        lambda: read_recording(file),
+        lambda: measure_coverage(scaled),
+        lambda: replay(scaled),
+    ):
+        with pytest.raises(InvalidArgumentError, match=rf"recording: .*{words}.* m/s") as error:
+            refuse()
+        speed = float(str(error.value).split(" m/s")[0].split()[-1])
+        assert 0.9 * scale < speed < 1.6 * scale
+
+
+def test_people_who_stand_are_plausible():
+    times = np.repeat([0.0, 0.4, 0.8], 2)
+    who, places = np.tile([1, 2], 3), np.tile([[0.0, 0.0], [3.0, 1.0]], (3, 1))
+    Recording.from_rows(times, who, places).require_plausible()
+    Recording.from_rows(times[:2], who[:2], places[:2]).require_plausible()
 
 
 def test_rows_in_any_order_and_frames_left_out(tmp_path):
     file = tmp_path / "crowd.txt"
     file.write_text("30 1 3 0\n0 1 0 0\n10 2 5 5\n20 1 2 0\n0 2 4 4\n\n10 1 1 0\n90 7 1 1\n")
-    read = read_recording(file)
+    read = read_recording(file, rate=25.0)
     assert np.allclose(read.times, [0, 0.4, 0.8, 1.2, 3.6])
     assert [who.tolist() for who in read.names] == [[1, 2], [1, 2], [1], [1], [7]]
     assert read.positions[1].tolist() == [[1, 0], [5, 5]]
@@ -53,8 +124,8 @@ def test_rows_in_any_order_and_frames_left_out(tmp_path):
 def test_forced_layouts_take_further_columns(tmp_path):
     file = tmp_path / "crowd.txt"
     file.write_text("0 1 2 3 0.5 0 0 0\n10 1 2 4 0.5 0 0 0\n")
-    assert read_recording(file).positions[0].tolist() == [[2, 0.5]]
-    assert read_recording(file, layout="text").positions[0].tolist() == [[2, 3]]
+    assert read_recording(file, rate=25.0).positions[0].tolist() == [[2, 0.5]]
+    assert read_recording(file, rate=25.0, layout="text").positions[0].tolist() == [[2, 3]]
     with pytest.raises(InvalidArgumentError, match="'csv' is none of obsmat, text"):
         read_recording(file, layout="csv")
 

@@ -30,11 +30,17 @@ def rows(recording, step):
             yield step * k, int(name), float(x), float(y)
 
 
-def write_obsmat(recording, file, step=10):
-    lines = [
-        f"   {f:e}   {n:e}   {x:.9e}   0.0   {y:.9e}   0.0   0.0   0.0  \n"
-        for f, n, x, y in rows(recording, step)
-    ]
+def write_obsmat(recording, file, step=10, scale=1.0):
+    """With the velocities at the annotations, or `scale` times that."""
+    velocity = {
+        (time, name): scale * np.gradient(p, times, axis=0)[k] if len(times) > 1 else np.zeros(2)
+        for name, (times, p) in recording.paths.items()
+        for k, time in enumerate(times)
+    }
+    lines = []
+    for f, n, x, y in rows(recording, step):
+        vx, vy = velocity[recording.times[f // step], n]
+        lines.append(f"   {f:e}   {n:e}   {x:.9e}   0.0   {y:.9e}   {vx:.9e}   0.0   {vy:.9e}  \n")
     file.write_text(HEADER + "".join(lines))
     return file
 
