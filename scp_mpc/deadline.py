@@ -142,10 +142,13 @@ class Clock:
         self._programs -= task in _COUNTED
         return True
 
-    def room(self, task: str, most: int, then: str = "") -> int:
-        """How often, up to `most` times, a task fits in before another one, as predicted."""
+    def room(self, task: str, most: int, then: str = "", spare: int = 0) -> int:
+        """How often, up to `most` times, a task fits in before another one, as predicted.
+
+        Of the budget of programs, so many are to be spared.
+        """
         if task in _COUNTED:
-            most = int(min(self._programs, most))
+            most = int(max(min(self._programs - spare, most), 0))
         if self._deadline == inf:
             return most
         after = self._pace.expected(then) + self._pace.expected("ending")

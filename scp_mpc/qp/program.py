@@ -97,7 +97,7 @@ class Backend(ABC):
 
     name: str
     noise: float = 1e-7
-    stages: tuple[tuple[int, int], ...] = ((1, 20),)
+    stages: tuple[tuple[int, int], ...] = ((1, 100),)
 
     @abstractmethod
     def load(self, start: tuple[FloatArray, FloatArray]) -> None:

@@ -253,7 +253,8 @@ class MultiStart:
                 for path in varied(step, about.passing(candidate), full)
             ]
             done += beam
-            most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration")
+            spare = 2 * self._settings.max_iterations  # to follow the best, and what comes then
+            most = clock.room("candidate", MOST_AMONG_WALLS, then="iteration", spare=spare)
             if not paths or not most:
                 break
             began = clock.mark()

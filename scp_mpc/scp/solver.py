@@ -333,12 +333,17 @@ class SCP:
         known = self._fallback.best(step, last, best, brake_first)
         if not known.status.ok:
             return known
-        own = self._motion(known.iterate)
-        self._at.step = self._widened(step, own) if self._between else step
-        better = self._loop.run(self._at.at(known.iterate))
-        if better is None or not better.status.ok:
-            return known
-        return better if not self._between or self._is_kept(step, own, better) else known
+        better = known
+        for _ in range(_CORRECTIONS):
+            own = self._motion(better.iterate)
+            self._at.step = self._widened(step, own) if self._between else step
+            found = self._loop.run(self._at.at(better.iterate))
+            if found is None or not found.status.ok:
+                return known
+            better = found
+            if not self._between or self._is_kept(step, own, better):
+                return better
+        return known
 
     def _is_clear(self, step: Step, plan: Nominal) -> bool:
         path, s = self._at.path(plan.y), plan.y[self._at.layout.s]

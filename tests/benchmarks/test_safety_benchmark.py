@@ -12,7 +12,7 @@ from benchmarks.safety import broken, episode, judged, main, summarise
 from benchmarks.safety_drive import Drive, drive
 from benchmarks.safety_search import is_reachable
 from benchmarks.safety_worlds import ROBOTS, SHARES, Thing, World
-from scp_mpc import MPC, Settings, Status
+from scp_mpc import MPC, SCP, Settings, Status
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 STILL = np.zeros(2)
@@ -128,6 +128,35 @@ def test_a_path_leads_out_of_a_pocket(monkeypatch):
     pocket = [box(2.5, 0.0, [0.1, 1.2]), *(box(1.8, y, [0.7, 0.1]) for y in (-1.2, 1.2))]
     assert not drive(world(pocket), along=False).arrived
     assert drive(world(pocket)).arrived
+
+
+@pytest.mark.parametrize(
+    ("seed", "moving", "horizon"),
+    [
+        pytest.param(2, True, 16, id="what is rescued is judged by its own motion"),
+        pytest.param(45, True, 17, id="programs are left to follow", marks=pytest.mark.slow),
+        pytest.param(21, False, 45, id="a long horizon", marks=pytest.mark.slow),
+    ],
+)
+def test_the_first_step_is_a_plan(seed, moving, horizon):
+    """Not braking, as it was in these worlds for one reason each."""
+    w = World(seed, moving)
+    told = [replace(thing, variances=np.resize(thing.variances, horizon + 1)) for thing in w.things]
+    told = [thing.prediction(0.0, w.dt) for thing in told]
+    solver = SCP(replace(w.problem, horizon=horizon), Settings(deadline=None))
+    plan = solver.solve(w.start, w.x_ref, told)
+    assert plan.status is Status.CONVERGED
+    assert np.linalg.norm(plan.X[-1] - w.start) > 1.0
+
+
+def test_a_rescue_repairs_many():
+    """From rest, a horizon of 45 and a bound on the speed: PIQP's own set is wrong by 22."""
+    w = World(21)
+    told = [replace(thing, variances=np.zeros(46)).prediction(0.0, w.dt) for thing in w.things]
+    solver = SCP(replace(w.problem, horizon=45), Settings(deadline=None, multi_start=False))
+    start = np.array([0.01, 0.0, 0.0, 0.0])
+    guess = solver.brake(start, w.x_ref).iterate
+    assert solver.solve(start, w.x_ref, told, guess).status is Status.CONVERGED
 
 
 @pytest.mark.slow

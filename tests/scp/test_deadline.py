@@ -80,6 +80,7 @@ def test_what_is_too_long_for_any_step_is_tried_again_and_believed():
 def test_a_budget_of_programs_ends_the_search_without_a_deadline():
     clock = Clock(None, Pace(), programs=3)
     assert clock.room("candidate", 9) == 3
+    assert [clock.room("candidate", 9, spare=spare) for spare in (1, 3, 5)] == [2, 0, 0]
     assert [clock.allows(task) for task in ("iteration", "backup", "candidate", "iteration")]
     assert not clock.allows("iteration")
     assert not clock.allows("candidate")
