@@ -1,13 +1,14 @@
 """Candidates that pass an obstacle on its other sides, or one stage earlier or later.
 
-One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front
-of it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too
-late, is a local optimum. A candidate is a path that need not obey the dynamics: the plan that
-ignores the obstacles; but during one conflict it is put off or brought forward by a stage or two of
-the relative motion and pushed out of the no-go set, and during the other conflicts it is the
-present plan. For an obstacle that crosses, the two sides are before it and behind it. Linearising
-about the path gives half-spaces on that side, sound as any. Polytopes often stand together, as
-walls do: there are candidates that pass all of them on one side, the first few on either, or none.
+One linearisation keeps to one side of an obstacle, and at each stage to where it stands in front of
+it, beside it or behind it. A plan that trails behind an obstacle, or passes it one sample too late,
+is a local optimum. A candidate is a path that need not obey the dynamics: the plan that ignores the
+obstacles; but during one conflict it is put off or brought forward by a stage or two of the
+relative motion and pushed out of the no-go set, and during the other conflicts it is the present
+plan. Or it stays in front of the first obstacle in its way. For an obstacle that crosses, the two
+sides are before it and behind it. Linearising about the path gives half-spaces on that side, sound
+as any. Polytopes often stand together, as walls do: there are candidates that pass all of them on
+one side, the first few on either, or none.
 
 Notation:
     C                   collision nodes of the plan
@@ -51,12 +52,14 @@ class CandidatePath:
         normal: (d,) from the obstacle to where the path passes.
         time: Stages by which it passes earlier than the free plan would.
         path: (C, d) positions to linearise about.
+        waits: Whether it stays in front of the obstacle.
     """
 
     obstacle: int
     normal: FloatArray
     time: float
     path: FloatArray
+    waits: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +82,20 @@ def candidate_paths(
     s: FloatArray,
     most: int = MAX_CANDIDATES,
 ) -> list[CandidatePath]:
-    """Return the ways past the obstacles in conflict, the first conflict first; none without any.
+    """Return the ways past the obstacles in conflict, first conflicts first, and one that waits.
 
     Args:
         step: The control step.
         free: (C, d) positions of the plan that ignores the obstacles.
         present: (C, d) positions of the best plan so far.
         s: (M,) sizes of the ellipsoids.
-        most: How many ways to return at most.
+        most: How many ways past to return at most.
     """
     conflict = step.depths(free, s) > 0
     first = np.where(conflict.any(axis=1), conflict.argmax(axis=1), conflict.shape[1])
     count = np.count_nonzero(first < conflict.shape[1])
     order = np.argsort(first, kind="stable")[:count].tolist()
-    ways = (
+    ways: Iterator[CandidatePath] = (
         side
         for j in order
         for side in _paths_past(
@@ -100,15 +103,23 @@ def candidate_paths(
         )
     )
     if step.shapes is not None:
-        together = _together(step, free, s, conflict, step.shapes.slots)
-        return list(islice(chain(together, ways), most))
-    return list(islice(ways, most))
+        ways = chain(_together(step, free, s, conflict, step.shapes.slots), ways)
+    return [*islice(ways, most), *(_waiting(step, free, j, conflict[j]) for j in order[:1])]
+
+
+def _waiting(step: Step, free: FloatArray, j: int, conflict: BoolArray) -> CandidatePath:
+    """Stay where the free plan comes into conflict, in front of the obstacle."""
+    points = np.flatnonzero(conflict)
+    v, _ = _directions(free - step.means[j, 1:], points, step.nodes.count)
+    path = free.copy()
+    path[points[0] :] = free[points[0] - 1] if points[0] else step.here
+    return CandidatePath(j, -v / np.linalg.norm(v), 0.0, path, waits=True)
 
 
 def _together(
     step: Step, free: FloatArray, s: FloatArray, conflict: BoolArray, walls: IntArray
 ) -> Iterator[CandidatePath]:
-    """Stay in front of the polytopes in conflict; or pass them, each on either side."""
+    """Pass the polytopes in conflict, each on either side."""
     hit = conflict[walls]
     if not hit.any():
         return
@@ -116,10 +127,7 @@ def _together(
     order = np.argsort(np.where(hit.any(axis=1), hit.argmax(axis=1), len(free)), kind="stable")
     walls = walls[order]
     j = int(walls[0])
-    v, normals = _directions(free - step.means[j, 1:], points, step.nodes.count)
-    waiting = free.copy()
-    waiting[points[0] :] = free[points[0] - 1] if points[0] else step.here
-    yield CandidatePath(j, -v / np.linalg.norm(v), 0.0, waiting)
+    _, normals = _directions(free - step.means[j, 1:], points, step.nodes.count)
     body = Walls.of(step, s, walls, slice(0, len(free)))
     for n in normals if len(walls) > 1 else ():
         yield CandidatePath(j, n, 0.0, body.aside(free[None], n[None])[0])

@@ -34,6 +34,7 @@ _STRONG = 1e-6  # force, relative to the largest, from which a constraint is str
 _TOUCH = 1e-7  # distance to a constraint that is none
 _DEPENDENT = 1e-12  # of the largest eigenvalue of rows rows': none
 _LEAST = 1e-300
+_ROUNDING = 1e-10  # of a bounded state beyond its bounds, which costs nothing
 CURVATURE_TOLERANCE = 1e-6  # of the largest curvature: what is less is taken for flat
 
 
@@ -177,7 +178,7 @@ class Certificate:
             allowed = np.zeros(len(boxed))
             if c.size > c.u.stop:  # only changes and states can be beyond their bounds
                 beyond = np.maximum(0.0, -np.minimum(below, above))
-                excess = beyond[c.states]
+                excess = np.where(beyond[c.states] > _ROUNDING, beyond[c.states], 0.0)
                 if wide is not bounds:
                     low, high = (lower - wide[0])[c.boxed], (wide[1] - upper)[c.boxed]
                     allowed = np.minimum(beyond, np.where(below < 0, low, high))

@@ -4,10 +4,12 @@ All are ranked by the programs that linearise about them. The multipliers that O
 iterations bound a program's optimum from below, and tightly: most candidates are cut off by that,
 and many by the multipliers that the same one had one control step before, without any iteration.
 The best are followed to their end, and win if they are better by enough. Where the plan needs
-slack, more are followed until one does not.
+slack, more are followed until one does not. Waiting in front of an obstacle is cheap over a short
+horizon, which does not show what it costs in the end: it has to promise half of the plan's cost.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
@@ -33,7 +35,8 @@ from scp_mpc.scp.transcription import Relaxation, Transcription
 
 # It must be better by this share, or the plan flickers between candidates of equal cost.
 _HYSTERESIS = 0.001
-_MOST_UNSAFE = 8  # candidates that are followed where the plan needs slack
+_MOST_FOLLOWED = 8  # candidates, where the plan needs slack or others promise much
+_PROMISING = 0.5  # share of the plan's merit that is much less
 _CUTOFF = 3.0  # times the plan's own merit: more than that one program does not make good
 _BEAM = 3  # candidates among polytopes that are varied
 _ROUNDS = 5  # of variations
@@ -53,12 +56,14 @@ class Ranked:
         planes: Its half-spaces, about the path.
         force: (nf + K,) its multipliers.
         v: (nv,) the point reached; None if it cannot win.
+        waits: Whether its path stays in front of an obstacle.
     """
 
     merit: float
     planes: Planes
     force: FloatArray
     v: FloatArray | None = None
+    waits: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +130,8 @@ class MultiStart:
         known = {} if last is None else last.alternatives
         about = self._incumbent(best.nominal, free)
         old = [known.get(key) for key in keys]
-        looks = self._rank(best, about, [candidate.path for candidate in candidates], old, thorough)
+        paths, waits = [way.path for way in candidates], [way.waits for way in candidates]
+        looks = self._rank(best, about, paths, old, thorough, waits)
         ranked = [one for one in looks if one is not None]
         clock.learn("candidate", began, len(ranked))
         tried = tuple(
@@ -139,10 +145,15 @@ class MultiStart:
             ranked = self._searched(best, about, ranked, full)
             follow += _BEAM - 1  # some lead to where we are
         goal, switched = best, False
-        ranked = sorted(ranked, key=lambda one: one.merit)  # ties keep their order
-        # A plan with slack is beaten by any without: then more candidates are worth their time.
-        for one in ranked[: follow if safe else _MOST_UNSAFE]:
-            if one.v is None or (not safe and goal.status.ok) or not clock.allows("iteration"):
+        # Ties keep their order. What waiting costs in the end, no horizon shows: it comes last.
+        ranked = sorted(ranked, key=lambda one: (one.waits, one.merit))
+        # A plan with slack is beaten by any without, and one that costs far more by others: then
+        # more candidates are worth their time.
+        for k, one in enumerate(ranked):
+            little = safe and one.merit > _PROMISING * goal.merit
+            if one.v is None or (little and (one.waits or k >= follow)):
+                continue
+            if (not safe and goal.status.ok) or not clock.allows("iteration"):
                 break
             if safe and same_pattern(step, about.passing(one), here):
                 continue  # this candidate leads to where we are
@@ -175,11 +186,13 @@ class MultiStart:
         paths: list[FloatArray],
         known: list[Duals | None],
         thorough: bool,
+        waits: Sequence[bool] = (),
     ) -> list[Ranked | None]:
         """Look at one program about each path (C, d), all linearised at once, until the deadline.
 
         Those come first that seem best by the multipliers of the step before: they tell soonest how
-        much the others would have to be worth. None for those for which there was no time.
+        much the others would have to be worth. None for those for which there was no time. A path
+        that waits is no measure for others: what it costs in the end, no horizon shows.
         """
         at, c = self._at, self._at.layout
         ys = np.repeat(about.plan.y[None], len(paths), axis=0)
@@ -198,12 +211,15 @@ class MultiStart:
             bound, qp, planes, force = programs[k]
             if not at.clock.allows("candidate"):
                 break
-            if force is not None and bound > limit:
+            waiting = any(waits[k : k + 1])
+            most = _PROMISING * best.merit if waiting and best.status.ok else limit
+            if force is not None and bound > most:
                 at.hard.solver.finished["cut"] += 1
                 looks[k] = Ranked(inf, planes, force)
                 continue
-            looks[k] = one = self._look(about, planes, relaxation, qp, limit, thorough)
-            if only_best:
+            one = self._look(about, planes, relaxation, qp, most, thorough)
+            looks[k] = replace(one, waits=waiting)
+            if only_best and not waiting:
                 limit = min(limit, one.merit)
         return looks
 

@@ -1,6 +1,7 @@
 """The solver of one control step: puts the loop, its starts and what lies below it together.
 
-    free plan, which ignores the obstacles: if it is clear of them, nothing can be better
+    free plan, which ignores the obstacles: if it is clear of them, nothing can be better;
+                 a nonlinear robot that would stand short of its goal tries some manoeuvres first
     nominal = previous plan, shifted (or the free plan)
     loop         half-spaces about the nominal -> quadratic program -> new nominal, until the KKT
                  residual of the original problem is below the tolerance, or the time is up
@@ -29,10 +30,12 @@ from scp_mpc.geometry.margin import JointRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import QuadraticProgram
+from scp_mpc.scp.braking import AT_REST
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.iterate import Iterate, as_iterate
 from scp_mpc.scp.loop import Loop
+from scp_mpc.scp.manoeuvres import manoeuvres
 from scp_mpc.scp.multi_start import Found, MultiStart
 from scp_mpc.scp.nodes import Motion, Nodes
 from scp_mpc.scp.plan import Plan, Result, Status, Timing
@@ -46,6 +49,8 @@ _log = logging.getLogger(__name__)
 
 _CORRECTIONS = 4  # of what was assumed about the motion between nodes
 _WARM_UP = 3  # steps
+_MANOEUVRES = 3  # that are followed
+_BETTER = 1e-3  # share of the merit by which one has to win
 
 
 class SCP:
@@ -320,8 +325,32 @@ class SCP:
             found = None
             if last is None or not last.touches or at.clock.room("iteration", 2) == 2:
                 found = self._loop.run(start, limit=limit)
-            plan = start if found is None or found.nominal is None else found.nominal
+            found = found or self._loop.result(start)
+            if last is None or self._stands(found):
+                found = self._other_start(found)
+            plan = found.nominal or start
         return plan
+
+    def _stands(self, plan: Result) -> bool:
+        """Whether a plan hardly moves, and not because it is where it is to be."""
+        step, model, states = self._at.step, self.problem.model, plan.iterate.states
+        away, wanted = (
+            float(np.abs(x[1:, model.position] - step.here).max()) for x in (states, step.x_ref)
+        )
+        return away < AT_REST * model.dt * self.problem.horizon < wanted
+
+    def _other_start(self, best: Result) -> Result:
+        """The best plan of a nonlinear robot from some manoeuvres, if better than this one."""
+        at, clock = self._at, self._at.clock
+        if at.linear or not clock.allows("manoeuvres"):
+            return best
+        with clock.task("manoeuvres"):
+            starts = manoeuvres(at.step, _MANOEUVRES)
+        for inputs in starts:
+            found = self._loop.run(at.plain(inputs), best)
+            if found is not None and found.beats(best, _BETTER * best.merit):
+                best = found
+        return best
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result, brake_first: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.

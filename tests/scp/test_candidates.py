@@ -20,11 +20,26 @@ def conflicts(step, path, s):
 
 
 def ways(case, reference, obstacles, present=None):
-    """Ways past, about a plan that follows the reference."""
+    """Ways past, about a plan that follows the reference; not those that wait."""
     step = Step.read(case, reference[0], reference, obstacles)
     free = reference[1:, case.model.position]
     s = np.full(case.max_obstacles, S_REF)
-    return step, candidate_paths(step, free, free if present is None else present, s)
+    found = candidate_paths(step, free, free if present is None else present, s)
+    return step, [way for way in found if not way.waits]
+
+
+def test_one_path_stays_in_front_of_the_first_obstacle():
+    case, ref = problem(N, "exact", max_obstacles=2), straight_reference(N)
+    obstacles = [obstacle(N, (x, 0.1), growth=0.0) for x in (4.0, 2.5)]
+    step, free = Step.read(case, ref[0], ref, obstacles), ref[1:, [0, 2]]
+    found = candidate_paths(step, free, free, np.full(2, S_REF))
+    (waiting,) = [way for way in found if way.waits]
+    first = int(conflicts(step, free, np.full(2, S_REF))[1].argmax())
+    assert waiting.obstacle == 1
+    np.testing.assert_allclose(waiting.normal, [-1.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(waiting.path[:first], free[:first])
+    np.testing.assert_array_equal(waiting.path[first:], np.tile(free[first - 1], (N - first, 1)))
+    assert not conflicts(step, waiting.path, np.full(2, S_REF)).any()
 
 
 def test_the_free_plans_own_time_passes_left_and_right():
