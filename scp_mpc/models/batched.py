@@ -63,11 +63,13 @@ class Batched:
         Raises:
             ShapeError: It returns another shape.
         """
-        lead = states.shape[:-1]
+        lead, x, u = states.shape[:-1], states.view(), inputs.view()
         if inputs.shape[:-1] != lead:
             lead = np.broadcast_shapes(lead, inputs.shape[:-1])
-        x = np.broadcast_to(states, (*lead, states.shape[-1]))  # read-only, too
-        u = np.broadcast_to(inputs, (*lead, inputs.shape[-1]))
+            x = np.broadcast_to(states, (*lead, states.shape[-1]))
+            u = np.broadcast_to(inputs, (*lead, inputs.shape[-1]))
+        x.setflags(write=False)  # whatever a user's function does
+        u.setflags(write=False)
         if self.layout == "any":
             return self._shaped(self._read(self._function(x, u)), (*lead, *self._shape))
         x, u = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])

@@ -6,6 +6,7 @@ Notation:
     m (nx,)     weights of g's entries
 """
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -64,7 +65,7 @@ class CasadiModel(FunctionModel):
     ) -> None:
         """Differentiate, and check everything that can be checked."""
         dynamics = _dynamics(function, x, u)
-        nx, nu = dynamics.size1_in(0), dynamics.size1_in(1)
+        nx, nu = self._nx, self._nu = dynamics.size1_in(0), dynamics.size1_in(1)
         self._rates, self._jacobian, self._hessian = _differentiated(dynamics, nx, nu)
         super().__init__(
             self._called,
@@ -82,17 +83,23 @@ class CasadiModel(FunctionModel):
             state=state,
         )
 
+    def derivative(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Return g (..., nx) at states (..., nx) and inputs (..., nu)."""
+        return self._called(states, inputs)
+
     def jacobians(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return dg/dz (..., nx, nx+nu) at states (..., nx) and inputs (..., nu)."""
-        return _mapped(self._jacobian, joined(states, inputs))
+        return _mapped(self._jacobian, (self.nx, self.nx + self.nu), joined(states, inputs))
 
     def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., n, n), for weights m (..., nx)."""
         z = joined(states, inputs)
-        return _mapped(self._hessian, z, np.broadcast_to(weights, (*z.shape[:-1], self.nx)))
+        return _mapped(
+            self._hessian, (z.shape[-1],) * 2, z, np.broadcast_to(weights, (*z.shape[:-1], self.nx))
+        )
 
     def _called(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
-        return _mapped(self._rates, joined(states, inputs))[..., 0, :]
+        return _mapped(self._rates, (self.nx,), joined(states, inputs))
 
 
 def _dynamics(function: Any, x: Any, u: Any) -> Any:
@@ -155,15 +162,14 @@ def _many(function: Any, count: int) -> Any:
     return function.map(count)
 
 
-def _mapped(function: Any, *arguments: FloatArray) -> FloatArray:
-    """Values (..., columns, rows) at points (..., size): CasADi's memory runs by columns."""
+def _mapped(function: Any, shape: tuple[int, ...], *arguments: FloatArray) -> FloatArray:
+    """Values (..., *shape) at points (..., size): CasADi's memory runs by columns."""
     lead = arguments[0].shape[:-1]
-    points = [np.ascontiguousarray(part, dtype=np.float64) for part in arguments]
-    count = int(np.prod(lead))
-    columns, rows = function.size_out(0)[::-1]
-    values = np.empty((*lead, columns, rows))
-    if count:
-        buffer, evaluate = _many(function, count).buffer()
+    values = np.empty((*lead, *shape))
+    if values.size:
+        # the buffer knows addresses only: copies have to live until it is evaluated
+        points = [np.ascontiguousarray(part, dtype=np.float64) for part in arguments]
+        buffer, evaluate = _many(function, math.prod(lead)).buffer()
         for i, part in enumerate(points):
             buffer.set_arg(i, part.data)
         buffer.set_res(0, values.data)

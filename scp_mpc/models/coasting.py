@@ -11,6 +11,7 @@ from scp_mpc.models.model import Model, courses
 
 _ROUNDS = 5
 _CUT = 1e-9
+_SETTLED = 1e-9  # relative change of an input that is none
 
 
 def coasting_stop(model: Model, x: FloatArray) -> FloatArray:
@@ -28,7 +29,10 @@ def coasting_stop(model: Model, x: FloatArray) -> FloatArray:
         by_u = (then.A - np.eye(model.nx))[model.position] @ first.B
         if not (np.isfinite(way).all() and np.isfinite(by_u).all()):
             return model.equilibrium_input.copy()  # LAPACK would print
-        u -= np.linalg.lstsq(by_u, way, rcond=_CUT)[0]
+        change = np.linalg.lstsq(by_u, way, rcond=_CUT)[0]
+        u -= change
+        if np.abs(change).max() <= _SETTLED * max(1.0, np.abs(u).max()):
+            break
     return u
 
 

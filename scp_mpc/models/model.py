@@ -293,6 +293,8 @@ def courses(velocity: FloatArray) -> FloatArray:
 
 def joined(states: FloatArray, inputs: FloatArray) -> FloatArray:
     """Return z (..., nx+nu) of states (..., nx) and inputs (..., nu)."""
+    if states.shape[:-1] == inputs.shape[:-1]:
+        return np.concatenate([states, inputs], axis=-1)
     shape = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1])
     parts = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in (states, inputs)]
     return np.concatenate(parts, axis=-1)
