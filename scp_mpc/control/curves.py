@@ -25,6 +25,9 @@ _CUTS = 64  # pieces of a circle
 _UNIT = 1e-8  # how far |dp/ds| may be from one
 _CUSP = 1e-5  # the same where a spline nearly turns on the spot
 _FINEST = 512  # pieces between two points of a spline
+_REPEATED = 1e-3  # of the mean distance between points, at which two are the same
+_BACK = 0.5  # of the distances around it, below which a step back is a mistake
+_BACKWARDS = -0.5  # sum of the cosines of both turns; -2 for there and back, 0 for a hairpin
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +79,11 @@ def spline(points: ArrayLike, closed: bool) -> Pieces:
     """The cubic spline through points (count, d), parametrised anew by its arc length.
 
     Raises:
-        InvalidArgumentError: Or a subclass, as `waypoints`; or the spline turns on the spot.
+        InvalidArgumentError: Or a subclass, as `waypoints`; or the points step back, or the spline
+            turns on the spot.
     """
     p = waypoints(points, closed)
+    _require_onward(p, closed)
     g = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     curve = CubicSpline(g, p, bc_type="periodic" if closed else "not-a-knot")
     cuts = 8
@@ -101,7 +106,8 @@ def waypoints(points: ArrayLike, closed: bool) -> FloatArray:
     Raises:
         ShapeError: Not (count, 2) or (count, 3), or too few.
         NotFiniteError: NaN or infinity.
-        InvalidArgumentError: A point is the same as the one before.
+        InvalidArgumentError: A point is the same as the one before, or nearly: a spline or a corner
+            would turn there and back.
     """
     p = as_array("points", points, (-1, 2), (-1, 3))
     least = 3 if closed else 2
@@ -110,12 +116,42 @@ def waypoints(points: ArrayLike, closed: bool) -> FloatArray:
         raise ShapeError("points", f"{len(p)} are too few: {kind} path needs {least}")
     if closed:
         p = np.concatenate([p, p[:1]])
-    same = np.linalg.norm(np.diff(p, axis=0), axis=1) <= 1e-9 * np.abs(p).max()
+    way = np.diff(p, axis=0)
+    length = np.linalg.norm(way, axis=1)
+    same = length <= np.maximum(1e-9 * np.abs(p).max(), _REPEATED * length.mean())
     if same.any():
         at = int(np.argmax(same))
-        after = (at + 1) % (len(p) - 1) if closed else at + 1
-        raise InvalidArgumentError("points", f"{at} and {after} are the same: {p[at]}")
+        raise InvalidArgumentError(
+            "points", f"{_pair(at, p, closed)} are the same: {length[at]:.3g} m apart at {p[at]}"
+        )
     return p
+
+
+def _require_onward(p: FloatArray, closed: bool) -> None:
+    """Raise where a way (count, d) steps back by far less than it goes on before and after.
+
+    A spline through such points makes loops as large as the steps around.
+    """
+    way = np.diff(p, axis=0)
+    length = np.linalg.norm(way, axis=1)
+    before, after = np.roll(length, 1), np.roll(length, -1)
+    turn = (way * np.roll(way, 1, axis=0)).sum(axis=1) / (length * before)  # cosines, from the last
+    turned = np.roll(turn, -1)  # to the next
+    if not closed:
+        before[0], after[-1] = np.inf, np.inf
+        turn[0], turned[-1] = turned[0], turn[-1]
+    back = (turn + turned < _BACKWARDS) & (length < _BACK * np.minimum(before, after))
+    if back.any():
+        at = int(np.argmax(back))
+        step = float(np.linalg.norm(p[at + 1] - p[at]))
+        raise InvalidArgumentError(
+            "points", f"{_pair(at, p, closed)} are a step back of {step:.3g} m"
+        )
+
+
+def _pair(at: int, p: FloatArray, closed: bool) -> str:
+    """Names of a point and the next one."""
+    return f"{at} and {(at + 1) % (len(p) - 1) if closed else at + 1}"
 
 
 def _by_length(curve: Any, g: FloatArray, cuts: int) -> Pieces:

@@ -190,7 +190,7 @@ class MPC:
         ahead = step.x_ref if nominal is None else nominal.states + (step.x0 - nominal.states[0])
         backup = self._backups.path(step.x0, self._backup, last)
         paths = np.stack([ahead, backup])[..., problem.model.position]
-        return most_dangerous(problem, obstacles, paths)
+        return most_dangerous(obstacles, paths, problem.max_obstacles)
 
     def _counted(self, plan: Plan, known: int) -> Plan:
         """The plan with how many of the known obstacles were left out; said once, too."""

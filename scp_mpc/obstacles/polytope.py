@@ -19,7 +19,8 @@ _UNBOUNDED, _EMPTY = 3, 2  # statuses of `linprog`
 class Polytope(Solid):
     """A convex polygon (d = 2) or polyhedron (d = 3) in its own frame.
 
-    The frame's axes are the world's: an obstacle with this shape does not turn. Walls with a bend,
+    The frame's axes are the world's, its origin is at the obstacle's position: corners in world
+    coordinates go with a position of zero, as by `static`, or are counted twice. Walls with a bend,
     rooms and other bodies that are not convex are several obstacles.
 
     Args:

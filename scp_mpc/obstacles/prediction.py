@@ -16,8 +16,11 @@ from scp_mpc.arrays import (
     require_interval,
     require_positive_semidefinite,
 )
-from scp_mpc.errors import BoundsError, InvalidArgumentError, ShapeError
+from scp_mpc.errors import BoundsError, GeometryError, InvalidArgumentError, ShapeError
 from scp_mpc.obstacles.solid import Solid
+
+_NEAR = 0.1  # of a body's size, beyond its faces, that counts as within
+_SAME = 1e-6  # of it, from its middle, that counts as there
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +40,8 @@ class ObstaclePrediction:
         radius: Radius of the obstacle, or by which its shape is rounded [m].
         stamp: Time of row 0 [s], on the clock of `MPC.step`; None for now.
         name: Who it is, the same at every step, for example a tracker's number; None for nobody.
-        shape: A `Polytope`; None for a ball. Of a polytope's covariances the largest standard
-            deviation counts, in all directions; zero covariances make it a wall.
+        shape: A `Polytope`, its corners relative to the means; None for a ball. Of its covariances
+            the largest standard deviation counts, in all directions; zero ones make it a wall.
         dt: Interval between rows [s]; None for the robot's.
 
     Attributes:
@@ -50,6 +53,7 @@ class ObstaclePrediction:
         NotFiniteError: NaN or infinity.
         CovarianceError: A covariance is not symmetric positive semi-definite.
         BoundsError: The radius is negative, or dt not positive.
+        GeometryError: Corners and means seem to be world coordinates both.
     """
 
     means: FloatArray
@@ -89,6 +93,7 @@ class ObstaclePrediction:
             _require_hashable(name)
         if shape is not None:
             _require_solid(shape, dim)
+            _require_own_frame(shape, mu[0])
         if dt is not None:
             dt = as_number("dt", dt)
             if dt <= 0:
@@ -224,6 +229,27 @@ def _require_solid(shape: object, dim: int) -> None:
         raise InvalidArgumentError("shape", f"{shape!r} is not a Polytope")
     if shape.dim != dim:
         raise ShapeError("shape", f"{shape.dim}-dimensional, but the means are {dim}-dimensional")
+
+
+def _require_own_frame(shape: Solid, mean: FloatArray) -> None:
+    """Raise if a body's corners are around its mean: then they would be offset by it once more.
+
+    A frame's origin may be outside of the body, and the obstacle may pass where its corners are in
+    their own frame. Both at once are refused if the origin is farther away than the body is large
+    and the mean within, or if the mean is the very middle of the corners.
+    """
+    middle = shape.vertices.mean(axis=0)
+    size = float(np.linalg.norm(shape.vertices - middle, axis=1).max())
+    outside = float((-shape.offsets).max())  # of the origin, from the farthest of the faces
+    within = bool((shape.normals @ mean <= shape.offsets + _NEAR * size).all())
+    centred = float(np.linalg.norm(mean - middle)) <= _SAME * size
+    if (within and outside > size) or (centred and outside > 0):
+        offset = float(np.linalg.norm(mean))
+        raise GeometryError(
+            "shape",
+            f"its corners are around the mean {mean.tolist()}: offset by {offset:.3g} m twice. "
+            "Corners are relative to the mean",
+        )
 
 
 def unchecked_predictions(

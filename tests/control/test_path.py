@@ -135,6 +135,44 @@ def test_corners():
     assert EIGHT.corners().max() < 1e-6
 
 
+WAY = np.array([[0, 0], [2, 0.5], [4, 1.5], [6, 1], [8, 0], [10, 0.5], [12, 2], [14, 2.0]])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("back", [1e-12, 1e-6, 1e-4, 1e-3, 0.01, 0.1, 0.5])
+@pytest.mark.parametrize("at", [0, 3, 7])
+def test_a_step_back_is_refused_and_named(at, back, scale):
+    """Of any length below the steps around it, wherever it is on the way."""
+    way = WAY[at] - WAY[at - 1] if at else WAY[1] - WAY[0]
+    extra = WAY[at] - back * way / np.linalg.norm(way)
+    points = scale * np.insert(WAY, at + 1, extra, axis=0)
+    with pytest.raises(InvalidArgumentError, match=rf"points: {at} and {at + 1} are") as error:
+        Path.spline(points)
+    step = float(str(error.value).split(" m")[0].split()[-1])
+    assert step == pytest.approx(scale * back, rel=0.01) or back < 1e-9
+    if back <= 1e-3:
+        with pytest.raises(InvalidArgumentError, match="are the same"):
+            Path.polyline(points)
+    Path.spline(scale * WAY)
+
+
+@pytest.mark.parametrize("back", [1e-6, 1e-3, 0.1, 0.6])
+def test_a_step_back_on_a_closed_way_is_refused(back):
+    square = np.array([[0.0, 0.0], [2, 0], [2, 2], [0, 2]])
+    for at, extra in ((1, [2 - back, 0.0]), (3, [back, 2.0])):
+        with pytest.raises(InvalidArgumentError, match=rf"points: {at} and {at + 1} are"):
+            Path.spline(np.insert(square, at + 1, extra, axis=0), closed=True)
+    with pytest.raises(InvalidArgumentError, match="points: 4 and 0 are"):
+        Path.spline(np.append(square, [[0.0, -back]], axis=0), closed=True)
+
+
+def test_turns_back_as_long_as_the_way_are_no_mistake():
+    Path.spline([[0, 0], [3, 0], [1, 1], [4, 1]])
+    Path.spline([[0, 0], [2, 0], [2, 0.2], [0, 0.2]])  # a hairpin
+    Path.spline([[0, 0], [2, 0], [1.9, 0.2], [0, 0.3]])
+    Path.polyline([[0, 0], [3, 0], [2.5, 0], [4, 0]])  # as told, corner by corner
+
+
 LINE = [[0, 0], [1, 0], [2, 1]]
 BAD = {
     "one point": (lambda: Path.polyline([[0, 0]]), ShapeError, "points: 1 are too few"),
