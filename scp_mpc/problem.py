@@ -57,6 +57,7 @@ from scp_mpc.geometry.margin import (
     StageRisk,
     size_at,
 )
+from scp_mpc.models.linear import LinearModel
 from scp_mpc.models.model import Model
 from scp_mpc.models.riccati import terminal_weight
 from scp_mpc.settings import require_positive
@@ -74,7 +75,7 @@ class Problem:
         model: Dynamics of the robot.
         horizon: N, the number of intervals; there are N + 1 states.
         Q: State weight (nx,) or (nx, nx), positive semi-definite.
-        R: Input weight (nu,) or (nu, nu), positive semi-definite.
+        R: Input weight (nu,) or (nu, nu), positive semi-definite; definite for nonlinear models.
         u_min: Lower input bounds, a number or (nu,).
         u_max: Upper input bounds, a number or (nu,).
         Qf: Weight of the last state; Q if None. "lqr": the solution of the Riccati equation, which
@@ -188,6 +189,9 @@ class Problem:
         nodes_per_interval = as_count("nodes_per_interval", nodes_per_interval)
         if margin is None:
             margin = Margin() if model.dim == 2 else Containment(0.95)
+        if isinstance(margin, float | int):
+            meant = f"Margin(reference={margin}, lower={margin})"
+            raise InvalidArgumentError("margin", f"{margin} is a number: {meant} has that size")
         if not isinstance(margin, MarginSpec):
             raise InvalidArgumentError("margin", f"{margin!r} is no Margin, risk or Containment")
         if growth_time is not None:
@@ -197,6 +201,11 @@ class Problem:
                     "growth_time", f"{growth_time} s would break the promise of {margin}"
                 )
         weights = as_weight("Q", Q, model.nx), as_weight("R", R, model.nu)
+        least = float(np.linalg.eigvalsh(weights[1])[0])
+        if least <= 0 and not isinstance(model, LinearModel):
+            raise InvalidArgumentError(
+                "R", f"is singular (smallest eigenvalue {least:g}), which needs a linear model"
+            )
         if isinstance(Qf, str) and Qf == "lqr":
             Qf = terminal_weight(model, *weights)
         values = {

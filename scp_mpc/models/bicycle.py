@@ -112,7 +112,7 @@ class KinematicBicycle(ComponentModel):
         The steering is that of the circle through neighbouring samples, at a single one straight.
         """
         course = courses(velocity)
-        speed = np.hypot(velocity[..., 0], velocity[..., 1])
+        speed = np.linalg.norm(velocity, axis=-1)
         turning = np.zeros_like(course)
         if course.ndim and course.shape[-1] > 1:
             turning = np.gradient(course, self.dt, axis=-1)

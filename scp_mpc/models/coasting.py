@@ -51,7 +51,7 @@ def coasting_state(model: Model, position: FloatArray, velocity: FloatArray) -> 
     free = [i for i in range(model.nx) if i not in fixed]
     for _ in range(_ROUNDS):
         there = model.linearise(x, model.equilibrium_input)
-        missing = model.dt * velocity - (there.after - x)[..., model.position]
+        missing = model.dt * np.asarray(velocity) - (there.after - x)[..., model.position]
         by_x = (there.A - np.eye(model.nx))[..., model.position, :][..., free]
         x[..., free] += (np.linalg.pinv(by_x, rcond=_CUT) @ missing[..., None])[..., 0]
     return x

@@ -71,7 +71,7 @@ class LinearModel(Model):
         """Number of inputs."""
         return int(self.B.shape[1])
 
-    def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
+    def _next(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state A x + B u."""
         return self.A @ x + self.B @ u
 
@@ -79,6 +79,7 @@ class LinearModel(Model):
         self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
     ) -> FloatArray:
         """Return the states (..., nx) after a share of an interval with the input held."""
+        states, inputs = np.asarray(states, np.float64), np.asarray(inputs, np.float64)
         A, B = self._powers(fraction)
         if A.ndim == 2:
             return states @ A.T + inputs @ B.T
@@ -106,7 +107,7 @@ class LinearModel(Model):
         fraction: ArrayLike = 1.0,  # noqa: ARG002
     ) -> FloatArray:
         """Return zeros (..., nx+nu, nx+nu)."""
-        lead = np.broadcast_shapes(states.shape[:-1], inputs.shape[:-1], costates.shape[:-1])
+        lead = np.broadcast_shapes(*(np.shape(z)[:-1] for z in (states, inputs, costates)))
         n = self.nx + self.nu
         return np.zeros((*lead, n, n))
 

@@ -95,8 +95,20 @@ class Model(ABC):
     ) -> Linearisation:
         """Return `advance` with its exact derivatives; arguments as there."""
 
-    def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the next state f(x, u) (nx,)."""
+    def step(self, x: ArrayLike, u: ArrayLike) -> FloatArray:
+        """Return the next state f(x, u) (nx,).
+
+        Raises:
+            ShapeError: x is not (nx,), or u not (nu,).
+        """
+        now, held = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+        for name, array, size in (("x", now, self.nx), ("u", held, self.nu)):
+            if array.shape != (size,):
+                raise ShapeError(name, f"shape {array.shape} is not ({size},)")
+        return self._next(now, held)
+
+    def _next(self, x: FloatArray, u: FloatArray) -> FloatArray:
+        """`step`, of arrays that fit; models override it where one state is the quicker."""
         return self.advance(x, u)
 
     def curvature(
@@ -280,6 +292,7 @@ def courses(velocity: FloatArray) -> FloatArray:
     Axis -2, where there is one, runs in time: without speed the last direction holds,
     before the first motion that one's, and 0 where there is none at all.
     """
+    velocity = np.asarray(velocity, dtype=np.float64)
     if velocity.ndim == 1:
         return courses(velocity[None])[0]
     moving = np.hypot(velocity[..., 0], velocity[..., 1]) > 1e-9

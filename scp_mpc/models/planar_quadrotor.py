@@ -91,7 +91,7 @@ class PlanarQuadrotor(ComponentModel):
         a tilt that follows twice critically damped.
         """
         g, k = self.gravity, 0.5 / self.dt
-        _, _, phi, v1, v2, omega = x.tolist()
+        _, _, phi, v1, v2, omega = np.asarray(x).tolist()
         across, up = (min(max(-v * k / 6, -g / 2), g / 2) for v in (v1, v2))
         wanted = atan2(across, g + up)
         thrust = max(across * sin(phi) + (g + up) * cos(phi), 0.0)

@@ -166,7 +166,7 @@ class Quadrotor(ComponentModel):
         an attitude that follows within two; the yaw stays.
         """
         g, rate = self.gravity, 0.5 / self.dt
-        _, _, _, v1, v2, v3, phi, theta, psi = x.tolist()
+        _, _, _, v1, v2, v3, phi, theta, psi = np.asarray(x).tolist()
         f1, f2, up = (min(max(-v * rate / 5, -g / 2), g / 2) for v in (v1, v2, v3))
         f3 = g + up
         ahead, left = cos(psi) * f1 + sin(psi) * f2, cos(psi) * f2 - sin(psi) * f1

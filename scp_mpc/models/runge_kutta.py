@@ -106,6 +106,7 @@ class ContinuousModel(Model):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States and inputs with the same leading axes, and h (..., 1)."""
         h = np.asarray(fraction, dtype=np.float64)[..., None] * (self.dt / self.substeps)
+        states, inputs = np.asarray(states, np.float64), np.asarray(inputs, np.float64)
         lead = states.shape[:-1]
         if inputs.shape[:-1] != lead or h.ndim > 1:
             lead = np.broadcast_shapes(lead, inputs.shape[:-1], h.shape[:-1])
@@ -165,7 +166,7 @@ class ComponentModel(ContinuousModel):
             slopes[..., i] = entry
         return slopes
 
-    def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
+    def _next(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state (nx,), in plain numbers: for one state they are the quicker."""
         now, held = x.tolist(), u.tolist()
         h = self.dt / self.substeps

@@ -63,7 +63,7 @@ class Unicycle(Model):
         """Return the states (..., 4) after a share of an interval with the input held."""
         return _Arc(states, inputs, self._time(fraction)).after()
 
-    def step(self, x: FloatArray, u: FloatArray) -> FloatArray:
+    def _next(self, x: FloatArray, u: FloatArray) -> FloatArray:
         """Return the next state (4,)."""
         p1, p2, theta, v = x.tolist()
         a, omega = u.tolist()
@@ -95,7 +95,8 @@ class Unicycle(Model):
     ) -> FloatArray:
         """Return sum_k y_k (Hessian of f_k in (x, u)), (..., 6, 6), after that share of dt."""
         arc = _Arc(states, inputs, self._time(fraction))
-        dual = costates[..., 0] - 1j * costates[..., 1]
+        y = np.asarray(costates)
+        dual = y[..., 0] - 1j * y[..., 1]
         bent = np.zeros((*np.broadcast_shapes(arc.way.shape, dual.shape), 6, 6))
         for (row, column), entry in arc.hessian().items():
             bent[..., row, column] = bent[..., column, row] = (dual * entry).real
@@ -107,7 +108,7 @@ class Unicycle(Model):
 
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return states (..., 4) at positions (..., 2) heading the way of velocities (..., 2)."""
-        speed = np.hypot(velocity[..., 0], velocity[..., 1])
+        speed = np.linalg.norm(velocity, axis=-1)
         moving = np.stack([courses(velocity), speed], axis=-1)
         return np.concatenate([position, moving], axis=-1)
 
@@ -120,6 +121,7 @@ class _Arc:
 
     def __init__(self, states: FloatArray, inputs: FloatArray, h: Any) -> None:
         """Evaluate from states (..., 4) with inputs (..., 2) held for times h (...)."""
+        states, inputs = np.asarray(states, np.float64), np.asarray(inputs, np.float64)
         self.states, self.inputs, self.h, self.half = states, inputs, h, 0.5 * h
         mu = self.half * inputs[..., 1]
         self.alpha = self.half * inputs[..., 0]

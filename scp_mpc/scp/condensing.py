@@ -28,7 +28,6 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs, dtbtrs, dtrtri
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.models.linear import LinearModel
 from scp_mpc.problem import Problem
 from scp_mpc.scp.layout import Layout
@@ -209,8 +208,6 @@ class Condenser:
             rest = np.zeros((N + 1, problem.model.nx)), np.zeros((N, problem.model.nu))
             self._always = Derivatives(A, B, *nodes.derivatives(*rest)[1:])
             self._sensitivity = self._sensitivity_along(self._always)
-        elif np.linalg.eigvalsh(problem.R)[0] <= 0:
-            raise InvalidArgumentError("R", "is singular, which a nonlinear model does not allow")
 
     def begin(self, step: Step) -> None:
         """Read a control step."""
