@@ -59,6 +59,14 @@ class MPC:
         self._counts: Counter[Status] = Counter()
         self._forget()
 
+    def __getstate__(self) -> dict[str, object]:
+        """All but the lock: a copy goes on from the same plan."""
+        return {name: value for name, value in self.__dict__.items() if name != "_busy"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Make a lock of its own."""
+        self.__dict__.update(state, _busy=Lock())
+
     def _forget(self) -> None:
         self._last: Iterate | None = None
         self._applied: FloatArray | None = None

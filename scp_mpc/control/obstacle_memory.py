@@ -4,7 +4,6 @@ Nothing here changes before `commit`: a step that fails in between leaves no tra
 """
 
 from collections.abc import Hashable, Iterable, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -53,7 +52,7 @@ class Recall(NamedTuple):
     newest: float | None
 
 
-_NOTHING: Mapping[Hashable, Report] = MappingProxyType({})
+_NOTHING: Mapping[Hashable, Report] = {}
 
 
 class ObstacleMemory:

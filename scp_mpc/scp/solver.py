@@ -19,6 +19,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 _CORRECTIONS = 4  # of what was assumed about the motion between nodes
 _WARM_UP = 3  # steps
-_MANOEUVRES = 3  # that are followed
+_MANOEUVRES = 2  # that are followed
 _BETTER = 1e-3  # share of the merit by which one has to win
 
 
@@ -82,6 +83,14 @@ class SCP:
         self._between = problem.nodes_per_interval > 1
         if self.settings.time_limit() is not None:
             self._warm_up()
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a copy is built from: solvers and locks are not copied."""
+        return {"problem": self.problem, "settings": self.settings, "timer": self._timer}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build the copy."""
+        self.__init__(**state)  # type: ignore[misc]
 
     def solve(
         self,
@@ -305,14 +314,12 @@ class SCP:
         optima only; where an obstacle shaped the last plan, only the sides of the obstacles are
         sought, and one program about it has to do.
         """
-        at, limit = self._at, None
+        at, limit, others = self._at, None, list[Nominal]()
         known = last if last is None or last.obstacle_free is None else last.obstacle_free
         plan = at.obstacle_free_optimum(known) if at.linear else None
         if plan is None:
             if last is None:
-                start = at.plain(
-                    np.tile(self.problem.model.equilibrium_input, (self.problem.horizon, 1))
-                )
+                start, *others = map(at.plain, self._starts())
             elif at.linear:
                 start = at.at(known or last, at.no_pairs.near)
             else:
@@ -326,10 +333,22 @@ class SCP:
             if last is None or not last.touches or at.clock.room("iteration", 2) == 2:
                 found = self._loop.run(start, limit=limit)
             found = found or self._loop.result(start)
-            if last is None or self._stands(found):
-                found = self._other_start(found)
+            if last is not None and self._stands(found):
+                others = [at.plain(inputs) for inputs in self._starts()]
+            for other in others:
+                end = self._loop.run(other, found)
+                found = end if end is not None and end.beats(found, _BETTER * found.merit) else found
             plan = found.nominal or start
         return plan
+
+    def _starts(self) -> list[FloatArray]:
+        """Inputs (N, nu) that lead near some local optima each: the best manoeuvres, and rest."""
+        at, clock, rest = self._at, self._at.clock, self.problem.model.equilibrium_input
+        starts = [np.tile(rest, (self.problem.horizon, 1))]
+        if not at.linear and clock.allows("manoeuvres"):
+            with clock.task("manoeuvres"):
+                starts = [*manoeuvres(at.step, _MANOEUVRES), *starts]
+        return starts
 
     def _stands(self, plan: Result) -> bool:
         """Whether a plan hardly moves, and not because it is where it is to be."""
@@ -338,19 +357,6 @@ class SCP:
             float(np.abs(x[1:, model.position] - step.here).max()) for x in (states, step.x_ref)
         )
         return away < AT_REST * model.dt * self.problem.horizon < wanted
-
-    def _other_start(self, best: Result) -> Result:
-        """The best plan of a nonlinear robot from some manoeuvres, if better than this one."""
-        at, clock = self._at, self._at.clock
-        if at.linear or not clock.allows("manoeuvres"):
-            return best
-        with clock.task("manoeuvres"):
-            starts = manoeuvres(at.step, _MANOEUVRES)
-        for inputs in starts:
-            found = self._loop.run(at.plain(inputs), best)
-            if found is not None and found.beats(best, _BETTER * best.merit):
-                best = found
-        return best
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result, brake_first: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.
