@@ -76,6 +76,14 @@ class WindAwareMPC:
         self._busy = Lock()
         estimator.reset()
 
+    def __getstate__(self) -> dict[str, object]:
+        """All but the lock: a copy goes on from the same plan."""
+        return {name: value for name, value in self.__dict__.items() if name != "_busy"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Make a lock of its own."""
+        self.__dict__.update(state, _busy=Lock())
+
     @property
     def problem(self) -> Problem:
         """The problem as it was given, without the disturbance."""

@@ -9,11 +9,14 @@ import pytest
 from scp_mpc import (
     MPC,
     SCP,
+    DisturbanceEstimator,
+    Disturbed,
     DoubleIntegrator,
     ObstaclePrediction,
     Problem,
     Settings,
     Unicycle,
+    WindAwareMPC,
 )
 
 
@@ -42,3 +45,15 @@ def test_a_copy_of_a_solver_solves_the_same():
     np.testing.assert_array_equal(
         pickle.loads(pickle.dumps(scp)).solve(*given).U, scp.solve(*given).U
     )
+
+
+def test_a_copy_against_the_wind_goes_on_with_what_it_felt():
+    model = DoubleIntegrator(0.2)
+    problem = Problem(model, horizon=8, Q=[1, 1, 1, 1], R=[1, 1], u_min=-1.0, u_max=1.0)
+    new = lambda: WindAwareMPC(problem, DisturbanceEstimator(Disturbed(model), std=0.1))  # noqa: E731
+    mpc, x = new(), np.zeros(4)
+    for _ in range(3):
+        x = model.step(x, mpc.step(x, np.ones(4)).u0) + [0.0, 0.1, 0.0, 0.0]
+    other = copy.deepcopy(mpc)
+    np.testing.assert_allclose(other.step(x, np.ones(4)).U, mpc.step(x, np.ones(4)).U, atol=1e-12)
+    assert not np.allclose(mpc.step(x, np.ones(4)).u0, new().step(x, np.ones(4)).u0)
