@@ -25,7 +25,7 @@ _CUTS = 64  # pieces of a circle
 _UNIT = 1e-8  # how far |dp/ds| may be from one
 _CUSP = 1e-5  # the same where a spline nearly turns on the spot
 _FINEST = 512  # pieces between two points of a spline
-_REPEATED = 1e-3  # of the mean distance between points, at which two are the same
+_REPEATED = 1e-4  # of the mean distance between points, at which two are the same
 _BACK = 0.5  # of the distances around it, below which a step back is a mistake
 _BACKWARDS = -0.5  # sum of the cosines of both turns; -2 for there and back, 0 for a hairpin
 

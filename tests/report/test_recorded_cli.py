@@ -77,6 +77,7 @@ def test_replay_passes_its_options_on(file, tmp_path):
         (["replay", "--horizon", 0], "horizon: 0"),
         (["replay", "--steps", 0], "steps: 0"),
         (["replay", "--noise", 0], "noise: 0"),
+        (["replay", "--obstacles", 0], "obstacles: 2 exceed max_obstacles = 0"),
         (["replay", "--speed", -1], "speed: -1"),
         (["replay", "--layout", "csv"], "layout: 'csv'"),
         (["coverage", "--rate", -1], "rate: -1"),

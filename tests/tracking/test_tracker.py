@@ -118,6 +118,26 @@ def test_a_silent_sensor_is_told_of_and_its_tracks_go_on_growing(dt):
     assert follower.healthy(7.0)
 
 
+def test_a_robot_does_not_drive_through_who_was_there_when_the_sensor_died():
+    """Somebody stands in the way; nothing is heard after 0.8 s, and the robot goes on for 6 s."""
+    problem = Problem(
+        DoubleIntegrator(0.2), horizon=10, Q=[1, 0.1, 1, 0.1], R=[0.1, 0.1], u_min=-2, u_max=2,
+        robot_radius=0.3, speed_max=1.0, nodes_per_interval=1, x_min=[-9, -9, -0.5, -9],
+        x_max=[9, 9, 0.5, 9],
+    )  # fmt: skip
+    follower, mpc = tracker(), MPC(problem, Settings(deadline=None))
+    x, gaps = np.zeros(4), []
+    for k in range(30):
+        if k < 5:
+            follower.update(0.2 * k, [[3.0, 0.0]])
+        plan = mpc.step(x, [6.0, 0, 0, 0], follower.predictions(0.2 * k), time=0.2 * k)
+        assert plan.step.count == 1
+        x = problem.model.step(x, plan.u0)
+        gaps.append(np.hypot(x[0] - 3.0, x[2]) - 0.6)
+    assert min(gaps) > 0
+    assert not follower.healthy(6.0)
+
+
 def test_who_was_missed_long_before_the_silence_ends():
     follower = tracker()
     for k in range(13):
