@@ -4,7 +4,7 @@ It sees them at the recording's frames, with noise, and crosses the scene, there
 as long as the recording lasts. Time 0 of the run is the first frame.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -48,6 +48,7 @@ def _place(times: FloatArray, positions: FloatArray, time: float) -> FloatArray:
 class RecordedSensor:
     """Measures people at the recording's own frames, with noise, and tracks them.
 
+    In frames that were left out nobody was seen: the tracker is told of nobody, not of nothing.
     The robot is told of all of them, and of its true state.
 
     Args:
@@ -61,9 +62,8 @@ class RecordedSensor:
     ) -> None:
         """Check the noise."""
         require_positive("noise", noise)
-        self._recording, self._noise = recording, noise
-        self._times = recording.times - recording.times[0]
-        self._tracking = tracking
+        self._noise, self._tracking = noise, tracking
+        self._frames = list(_frames(recording))
 
     def reset(self, scene: Scene, problem: Problem, rng: np.random.Generator) -> None:
         """Begin a new run."""
@@ -83,13 +83,22 @@ class RecordedSensor:
         positions: FloatArray,  # noqa: ARG002
     ) -> tuple[FloatArray, list[ObstaclePrediction]]:
         """See `Sensor`."""
-        while self._frame < len(self._times) and self._times[self._frame] <= time + _TICK:
-            where = self._recording.positions[self._frame]
+        while self._frame < len(self._frames) and self._frames[self._frame][0] <= time + _TICK:
+            when, names, where = self._frames[self._frame]
             measured = where + self._noise * self._rng.standard_normal(where.shape)
-            names = self._recording.names[self._frame].tolist()
-            self._tracker.update(self._times[self._frame], measured, names)
+            self._tracker.update(when, measured, names)
             self._frame += 1
         return x, self._tracker.predictions(time)
+
+
+def _frames(recording: Recording) -> Iterator[tuple[float, list[int], FloatArray]]:
+    """Times from the first frame on [s], names and positions, with those where nobody was."""
+    times = recording.times - recording.times[0]
+    for k, (names, where) in enumerate(zip(recording.names, recording.positions, strict=True)):
+        yield float(times[k]), names.tolist(), where
+        gap = times[k + 1] - times[k] if k + 1 < len(times) else 0.0
+        for n in range(1, round(gap / recording.interval) if recording.interval else 0):
+            yield float(times[k] + n * recording.interval), [], np.zeros((0, 2))
 
 
 def replay_problem(

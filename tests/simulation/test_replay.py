@@ -79,6 +79,20 @@ def test_the_tracker_gets_noisy_measurements_as_they_come(run):
     assert np.array_equal(new.states, run.states[:33])
 
 
+def test_nobody_in_a_frame_is_no_silence():
+    """Somebody leaves and somebody else comes 30 s later: nothing is told of in between."""
+    times = np.concatenate([np.arange(0, 4, 0.4), np.arange(34, 36, 0.4)])
+    who = np.where(times < 5, 1, 2)
+    places = np.stack([1.2 * (times - 34 * (times > 5)) - 3.0, np.zeros(len(times))], axis=1)
+    recording = Recording.from_rows(times, who, places)
+    run = replay(recording, Crossing([0, -9], [0, -5]), replay_problem(horizon=5))
+    told = np.array([len(there) for there in run.predictions])
+    seconds = run.times[:-1]
+    assert (told[(seconds > 3.6 + 1.5) & (seconds < 34)] == 0).all()
+    assert (told[seconds <= 3.6 + 1.4] == 1).all()
+    assert (told[seconds >= 34] == 1).all()
+
+
 def test_all_are_told_of_and_who_is_left_out_is_counted():
     problem = replay_problem(horizon=5, max_obstacles=2)
     run = replay(street(people=5, frames=20), Crossing([0, -5], [0, 5]), problem)
