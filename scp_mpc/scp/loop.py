@@ -41,6 +41,7 @@ _PATIENCE = 3  # iterations before a run towards a goal is given up
 _FAR = 1.1  # share of the goal's merit above which it is
 _NEARLY = 0.01  # [m], or unit of a state: a violation that steps onto the constraints may mend
 _ALIKE = 0.01  # relative difference of cost of plans that may become the same
+_CLOSE = 0.1  # share of the inputs' range that lies between plans that become the same
 
 
 class Loop:
@@ -160,8 +161,11 @@ class Loop:
         at, cost, there = self._at, trial.cost, goal.iterate
         if goal.status.ok and iterations >= _PATIENCE and cost > _FAR * goal.merit:
             return True
-        if not len(trial.force) or abs(cost - goal.cost) > _ALIKE * goal.cost:
+        if abs(cost - goal.cost) > _ALIKE * goal.cost:
             return False
+        if not len(trial.force):
+            apart = np.abs(trial.rollout.inputs - there.inputs)
+            return bool((apart <= _CLOSE * (at.problem.u_max - at.problem.u_min)).all())
         mine = PassingPattern(at.path(trial.y)[1:], trial.pairs.table(trial.force) > NEGLIGIBLE)
         path = at.nodes.positions(there.states, there.inputs)
         return same_pattern(at.step, mine, PassingPattern(path, there.touched[: at.step.count]))

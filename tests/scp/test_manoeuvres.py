@@ -54,24 +54,25 @@ def driven(problem, goal, heading=0.0, steps=90):
     return plans, float(np.hypot(*(x[problem.model.position] - goal)))
 
 
-@pytest.mark.parametrize("goal", [(0.0, 1.0), (-2.0, 0.0), (-1.0, -0.4), (0.1, -3.0)])
-@pytest.mark.parametrize("reverse", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("goal", "reverse"), [((0.0, 1.0), 1.0), ((-2.0, 0.0), 0.0), ((0.1, -3.0), 0.0)]
+)
 def test_a_unicycle_turns_towards_a_goal_beside_or_behind_it(goal, reverse):
-    plans, away = driven(parked(reverse), goal)
+    plans, away = driven(parked(reverse), goal, steps=60)
     assert away < 0.1
     assert not any(p.status is Status.CONVERGED and p.kkt.curvature < -1e-6 for p in plans)
 
 
 def test_a_bicycle_reverses_where_it_may_and_turns_round_where_not():
-    assert driven(steered(1.0), (-1.0, 0.5))[1] < 0.1
-    assert driven(steered(0.0, 40), (-3.0, 0.5), steps=70)[1] < 0.1
+    assert driven(steered(1.0), (-1.0, 0.5), steps=45)[1] < 0.1
+    assert driven(steered(0.0, 40), (-3.0, 0.5), steps=55)[1] < 0.1
 
 
 def test_a_robot_that_stands_is_given_a_new_goal_behind_it():
     problem = parked()
     mpc, x = MPC(problem, Settings(deadline=None)), np.zeros(4)
     for goal in (1.0, -1.0):
-        for _ in range(70):
+        for _ in range(45):
             x = problem.model.step(x, mpc.step(x, [goal, 0.0, 0.0, 0.0]).u0)
         assert abs(x[0] - goal) < 0.1
 
