@@ -34,7 +34,8 @@ from scp_mpc.scp.layout import Layout
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 
-_CLOSED = 1e-12  # defect that is none, relative to the largest state
+_CLOSED = 1e-12  # defect that is none
+_ROUNDINGS = 4 * 2.0**-52  # likewise, of the largest state
 _RIDGES = (1e-14, 1e-12, 1e-10)  # of the Hessian, relative to its largest diagonal entry
 _ROUNDS = 4  # of Newton's method, before stages are walked through one by one
 
@@ -320,7 +321,7 @@ class Condenser:
             A, B, after = self._linearised(states, inputs)
             defect = after - states[1:]
             worst = float(np.abs(defect).max())
-            if worst <= _CLOSED * max(1.0, float(np.abs(states).max())):
+            if worst <= _CLOSED + _ROUNDINGS * float(np.abs(states).max()):
                 return A, B
             if not worst < before:  # or NaN
                 return None

@@ -25,6 +25,7 @@ from scp_mpc.scp.subproblem import Subproblem
 from scp_mpc.settings import Settings
 
 _REPAIRS = 10  # of the bounds of a plan that ignores the obstacles
+_MOVED = 1e-6  # of a state, in its own unit: the robot is not where the guess has it
 _TOUCH = 1e-7  # distance to a constraint that counts as none
 _ROUNDING = 1e-10  # of a bounded entry, in its own unit
 _NEAR = 2.0  # [m] beyond the no-go set; pairs farther off stay out of the programs
@@ -162,7 +163,8 @@ class Transcription:
             about: (ny,) another point, pairs near to which are to be looked at, too.
         """
         inputs, guess = iterate.inputs, iterate.states[1:] - self.step.x_ref[1:]
-        if not self.linear and not np.allclose(self.step.x0, iterate.states[0]):
+        moved = np.abs(self.step.x0 - iterate.states[0]).max() > _MOVED
+        if moved and not self.linear:
             inputs, guess = self.condenser.tracking(iterate.states, inputs)
         y, rollout = self.rolled(inputs, iterate.s, guess)
         if near is None:
