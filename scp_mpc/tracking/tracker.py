@@ -211,8 +211,8 @@ class Tracker:
     def healthy(self, time: float) -> bool:
         """Whether the last update is at most `settings.silence` seconds old at a time [s].
 
-        False before the first one, too. Predictions of a silent sensor know of nobody new: a robot
-        should stand still among them.
+        False before the first one, too. Predictions of a silent sensor know of nobody new and grow
+        without end: a robot should brake, see `SCP.brake`, rather than plan with them.
         """
         now = as_number("time", time)
         return self._time is not None and now - self._time <= self.settings.silence + _TICK
