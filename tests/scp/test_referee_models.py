@@ -8,7 +8,7 @@ import pytest
 from instances import DT, instance, obstacle, rotated
 from models import OWN, draw
 from referee import Referee
-from referee_models import ModelReferee, symbolic
+from benchmarks.peers.referee import ModelReferee, symbolic
 
 from scp_mpc import SCP, Containment, DoubleIntegrator, ObstaclePrediction, Problem, Settings
 from scp_mpc.models import Unicycle

@@ -1,4 +1,4 @@
-"""An independent formulation for every model in CasADi: the referee of nonlinear convergence tests.
+"""An independent formulation for every model in CasADi: the referee of nonlinear plans.
 
 Nothing here comes from the package but the numbers of the problem. The dynamics are written anew;
 the unicycle's arc is a Gauss-Legendre quadrature. Outside an obstacle means that some n, |n| <= 1,
@@ -6,12 +6,15 @@ has n'(p - mu) - s sqrt(n' Sigma n) >= r, so that n joins the variables: by its 
 by its three entries in space. The sizes s are fixed, and nothing is softened.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import casadi
 import numpy as np
+
+from scp_mpc.arrays import FloatArray
 
 _OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 3000}
 _NEAR = {
@@ -27,13 +30,13 @@ _NEAR = {
 class Verdict:
     """What IPOPT found."""
 
-    X: np.ndarray
-    U: np.ndarray
+    X: FloatArray
+    U: FloatArray
     cost: float
     ok: bool
 
 
-def symbolic(model) -> Callable:
+def symbolic(model: Any) -> Callable[[Any, Any], Any]:
     """The next state in CasADi, of a state and an input in CasADi."""
     kind = type(model).__name__
     if hasattr(model, "A"):
@@ -64,7 +67,16 @@ class ModelReferee:
     """
 
     def __init__(
-        self, problem, x0, x_ref, obstacles, *, size=None, u_before=None, dynamics=None, **bounds
+        self,
+        problem: Any,
+        x0: Any,
+        x_ref: Any,
+        obstacles: Sequence[Any],
+        *,
+        size: float | None = None,
+        u_before: Any = None,
+        dynamics: Callable[[Any, Any], Any] | None = None,
+        **bounds: Any,
     ) -> None:
         self.problem = problem
         self.size = float(problem.size.reference if size is None else size)
@@ -83,7 +95,7 @@ class ModelReferee:
         cost, rows, lower, upper = 0, [], [], []
         self.kinds: list[str] = []  # of all rows
 
-        def demand(kind, row, low, high):
+        def demand(kind: str, row: Any, low: Any, high: Any) -> None:
             self.kinds += [kind] * row.numel()
             rows.append(row)
             lower.append(np.broadcast_to(low, row.numel()))
@@ -126,25 +138,28 @@ class ModelReferee:
         )
         self._given(x0, x_ref, obstacles)
 
-    def at(self, x0, x_ref, obstacles) -> "ModelReferee":
+    def at(self, x0: Any, x_ref: Any, obstacles: Sequence[Any]) -> "ModelReferee":
         """The same problem at another step, with as many obstacles."""
         assert len(obstacles) == len(self.obstacles)
         other = copy(self)
         other._given(x0, x_ref, obstacles)
         return other
 
-    def _given(self, x0, x_ref, obstacles) -> None:
+    def _given(self, x0: Any, x_ref: Any, obstacles: Sequence[Any]) -> None:
         self.obstacles = obstacles
         numbers = [x0, x_ref[1:], *(o.means[1:] for o in obstacles)]
         numbers += [*(o.covariances[1:] for o in obstacles)]  # symmetric
         numbers += [self.problem.robot_radius + o.radius for o in obstacles]
         self.p = np.concatenate([np.ravel(number) for number in numbers])
 
-    def solve(self, X, U, near: bool) -> Verdict:
+    def solve(self, X: FloatArray, U: FloatArray, near: bool) -> Verdict:
         """Run IPOPT from a plan; `near` keeps the barrier small so that it stays close by."""
         which = "near" if near else "far"
         if which not in self.compiled:
-            options = {"print_time": False, "ipopt": _OPTIONS | (_NEAR if near else {})}
+            options: dict[str, Any] = {
+                "print_time": False,
+                "ipopt": _OPTIONS | (_NEAR if near else {}),
+            }
             self.compiled[which] = casadi.nlpsol("referee", "ipopt", self.nlp, options)
         solver = self.compiled[which]
         result = solver(
@@ -161,7 +176,7 @@ class ModelReferee:
         ok = bool(solver.stats()["success"])
         return Verdict(np.vstack([X[:1], ends]), inputs, float(result["f"]), ok)
 
-    def kkt(self, plan) -> dict[str, float]:
+    def kkt(self, plan: Any) -> dict[str, float]:
         """KKT residuals of the original problem at a plan and its multipliers.
 
         One point in each interval; rates are not looked at.
@@ -201,7 +216,7 @@ class ModelReferee:
             ),
         }
 
-    def normals(self, positions: np.ndarray) -> np.ndarray:
+    def normals(self, positions: FloatArray) -> FloatArray:
         """Outward normals (M, N, d) at positions (N, d), by search in ever smaller caps."""
         rng = np.random.default_rng(0)
         means = np.array([obstacle.means[1:] for obstacle in self.obstacles])
@@ -218,14 +233,14 @@ class ModelReferee:
             width = 0.5 * min(width, 1.0)
         return n[:, :, 0]
 
-    def _sides(self, positions: np.ndarray) -> np.ndarray:
+    def _sides(self, positions: FloatArray) -> FloatArray:
         if not self.obstacles:
             return np.zeros(0)
         n = self.normals(positions)
         return np.arctan2(n[..., 1], n[..., 0]).ravel() if self.dim == 2 else n.ravel()
 
 
-def _arc(x, u, dt):
+def _arc(x: Any, u: Any, dt: float) -> Any:
     """The unicycle by quadrature: exact to rounding while it turns by less than about 3 rad."""
     nodes, weights = np.polynomial.legendre.leggauss(14)
     p1, p2, theta, v = casadi.vertsplit(x)
@@ -236,7 +251,7 @@ def _arc(x, u, dt):
     return casadi.vertcat(p1, p2, theta + dt * omega, v + dt * a)
 
 
-def _classical(rates, x, dt, substeps):
+def _classical(rates: Any, x: Any, dt: float, substeps: int) -> Any:
     h = dt / substeps
     for _ in range(substeps):
         k1 = rates(x)
@@ -247,7 +262,7 @@ def _classical(rates, x, dt, substeps):
     return x
 
 
-def _bicycle(model, x, u):
+def _bicycle(model: Any, x: Any, u: Any) -> Any:
     """Through the slip angle of the reference point, unlike the package."""
     slip = casadi.atan(model.rear / model.wheelbase * casadi.tan(x[4]))
     speed = x[3] / casadi.cos(slip)
@@ -260,12 +275,12 @@ def _bicycle(model, x, u):
     )
 
 
-def _planar(model, x, u):
+def _planar(model: Any, x: Any, u: Any) -> Any:
     thrust = u[0] * casadi.vertcat(casadi.sin(x[2]), casadi.cos(x[2]))
     return casadi.vertcat(x[3], x[4], x[5], thrust - casadi.DM([0.0, model.gravity]), u[1])
 
 
-def _space(model, x, u):
+def _space(model: Any, x: Any, u: Any) -> Any:
     """By rotation matrices, and the Euler rates from the inverse of their map to body rates."""
     roll, pitch, yaw = x[6], x[7], x[8]
     c, s = casadi.cos, casadi.sin
