@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test test-all check format bench risk soak wind clean
+.PHONY: demo test test-all check format bench risk safety soak wind clean
 
 demo: $(VENV)/.demo  ## run the report's four scenarios; tables and pictures go to out/
 	$(BIN)/scp-mpc report --out $(OUT)
@@ -29,6 +29,10 @@ bench: $(VENV)/.dev  ## all benchmarks; tables, figures and numbers go to benchm
 
 risk: $(VENV)/.dev  ## promised against measured risk, by Monte Carlo
 	$(BIN)/python benchmarks/risk.py --out $(OUT)
+
+safety: $(VENV)/.dev  ## random worlds: who is safe and who arrives; stop it and go on as you like
+	$(BIN)/python benchmarks/safety.py --kind standing --out $(OUT)/safety
+	$(BIN)/python benchmarks/safety.py --kind moving --out $(OUT)/safety
 
 soak: $(VENV)/.dev  ## a million control steps with faults; stop it and go on as you like
 	$(BIN)/python benchmarks/soak.py --out $(OUT)
