@@ -81,8 +81,10 @@ class Transcription:
         step: The control step, with radii and sizes as they count just now.
         no_pairs: No pairs at all.
         obstacle_free: The plan that ignores the obstacles, where another one was found.
+        suspected: Whether the log has it that the model's derivatives seem wrong.
     """
 
+    suspected = False
     step: Step
     no_pairs: Pairs
     obstacle_free: Iterate | None

@@ -6,6 +6,7 @@ constraints of the program its bounds push, so that no point that they hold is e
 a linear robot half-spaces are sound wherever they are taken, so that the region never acts.
 """
 
+import logging
 from math import inf
 
 import numpy as np
@@ -20,6 +21,9 @@ _SHRINK, _GROW = 0.3, 3.0
 _SMALLEST = 1e-8  # relative to the inputs' range, at which to give up
 _CLOSE = 1e-2  # KKT residual from which on its fall counts, whatever the merit does
 _NOISE = 1e-12  # of the merit, relative
+_SUSPICIOUS = 10  # refused steps in a row; with right derivatives few, near poles up to seven
+
+_log = logging.getLogger(__name__)
 
 
 class TrustRegion:
@@ -36,7 +40,7 @@ class TrustRegion:
         """Begin without limits."""
         span = (at.problem.u_max - at.problem.u_min) / 2
         self._at, self._span = at, np.tile(np.where(span > 0, span, 1.0), at.problem.horizon)
-        self._size, self._weight = inf, 0.0
+        self._size, self._weight, self._refused = inf, 0.0, 0
         self.radius: FloatArray | None = None
 
     def accepts(
@@ -63,6 +67,7 @@ class TrustRegion:
         bent = float(d @ at.curvature(program, solution) @ d) / 2
         predicted = before - program.qp.merit(refinement.v) - bent
         if before - after >= _ENOUGH * predicted - _NOISE * abs(before):
+            self._refused = 0
             if before - after >= predicted / 2:
                 self._resize(_GROW * self._size)
             return True
@@ -72,9 +77,22 @@ class TrustRegion:
     def shrinks(self, nominal: Nominal, program: Program, refinement: QPSolution) -> bool:
         """Trust only a part of the way that the inputs were to go; False where that is none."""
         u = self._at.layout.u
+        self._suspect()
         change = (program.condensed.y(refinement.v)[u] - nominal.y[u]) / self._span
         self._resize(_SHRINK * min(self._size, float(np.abs(change).max())))
         return self._size >= _SMALLEST
+
+    def _suspect(self) -> None:
+        """Count a refused step; say once what many in a row, ever smaller, must mean."""
+        self._refused += 1
+        if self._refused == _SUSPICIOUS and not self._at.suspected:
+            self._at.suspected = True
+            _log.warning(
+                "%d ever smaller steps in a row do not lower the cost as the derivatives of %s "
+                "predict: are its Jacobians right? Model.check compares them with differences",
+                self._refused,
+                type(self._at.problem.model).__name__,
+            )
 
     def _resize(self, size: float) -> None:
         self._size = size
