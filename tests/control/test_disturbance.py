@@ -229,7 +229,7 @@ def test_errors_leave_no_trace():
     x, x_ref = np.array([0.0, 2, 0, 0]), straight_reference(8)
     for each in (mpc, twin):
         each.step(x, x_ref)
-    things = [obstacle(8, (9.0, 9.0))] * 2  # one too many
+    things = [obstacle(9, (9.0, 9.0))]  # one row too many
     for bad in (
         {"y": x * np.nan},
         {"x_ref": x_ref[:3]},

@@ -34,11 +34,11 @@ from scp_mpc import (
 from scp_mpc.qp.backend import ProgramSolver
 
 SETTINGS = {
-    "plain": Settings(),
-    "one side": Settings(multi_start=False),
-    "piqp": Settings(solver="piqp", multi_start=False),
+    "plain": Settings(deadline=None),
+    "one side": Settings(deadline=None, multi_start=False),
+    "piqp": Settings(deadline=None, solver="piqp", multi_start=False),
     "late": Settings(deadline=1e-6),  # so early that every step is late in the same way
-    "short": Settings(max_iterations=2),
+    "short": Settings(deadline=None, max_iterations=2),
 }
 
 
