@@ -20,6 +20,7 @@ from scp_mpc.arrays import FloatArray
 
 _EPS = float(np.finfo(np.float64).eps)
 _DOUBT = 10.0  # times the spread of three differences, within which a derivative may be right
+_WILD = 1e3  # times the usual largest derivative: no place to judge
 _SWEEP = 4.0 ** np.arange(-4, 7)  # of steps
 _ROUNDINGS = 2.0  # of a value, in units of eps, likewise
 
@@ -87,7 +88,7 @@ def disagreement(
     Steps go through six decades. For each entry, those count about which three differences agree
     best at most points, and with those of smaller steps at all. There an entry is wrong if it is
     off by more than `tolerance` of itself, and by more than rounding of the values and ten times
-    the spread of the three explain.
+    the spread of the three explain. Nothing is said of points next to poles.
 
     Args:
         function: Batched, (..., m).
@@ -109,6 +110,8 @@ def disagreement(
     best = np.broadcast_to(np.argmin(usual, axis=0), (1, *given.shape))
     slope, doubt = (np.take_along_axis(part, best, 0)[0] for part in (middle, doubt))
     allowed = tolerance * np.abs(slope) + doubt
+    most = np.abs(slope).max(axis=(-2, -1), keepdims=True)
+    allowed[np.broadcast_to(most > _WILD * np.median(most), slope.shape)] = np.inf
     excess = np.nan_to_num(np.abs(given - slope) / (allowed + 1e-300), nan=0.0)
     at = tuple(int(i) for i in np.unravel_index(np.argmax(excess), excess.shape))
     return (at, float(slope[at])) if excess[at] > 1 else None

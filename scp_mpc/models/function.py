@@ -1,8 +1,9 @@
 """A robot given by functions: anybody's own dynamics.
 
 Differences of a next state x_{i+1} = g(x, u) far from the origin of its coordinates would be
-differences of large, rounded numbers. Where g(x, u) - x is the same with the position at zero, as
-that of nearly every robot is, they are taken there; this is looked at for each point anew.
+differences of large, rounded numbers. Where g(x, u) - x is the same with the position at zero and
+a little to all sides, as that of nearly every robot is, they are taken there; this is looked at
+for each point anew.
 
 Notation:
     g(x, u)     the function: x' [1/s] where continuous, else the next state
@@ -20,7 +21,7 @@ from scp_mpc.arrays import FloatArray, IntArray, as_array, as_count, frozen
 from scp_mpc.errors import InvalidArgumentError, ShapeError
 from scp_mpc.models.batched import Batched, Layout
 from scp_mpc.models.coasting import coasting_state, coasting_stop
-from scp_mpc.models.differences import differences, second_differences
+from scp_mpc.models.differences import differences, second_differences, steps
 from scp_mpc.models.model import (
     Linearisation,
     as_period,
@@ -249,15 +250,17 @@ class FunctionModel(ContinuousModel):
         """
         if not self._movable:
             return z, np.abs(self._at(z)).max(axis=-1, keepdims=True)
-        both = np.stack([z, z])
-        both[1, ..., self.position] = 0.0
-        values = self._at(both)
-        sizes = np.abs(values) + np.abs(both[..., : self.nx])
-        there, here = values - both[..., : self.nx]
-        rounding = _SAME * np.finfo(np.float64).eps * sizes.sum(axis=0)
-        alike = (np.abs(there - here) <= rounding).all(axis=-1, keepdims=True)
-        most = sizes.max(axis=-1, keepdims=True)
-        return np.where(alike, both[1], z), np.where(alike, most[1], most[0])
+        aside = steps(z, 1)[..., self.position, None] * np.eye(z.shape[-1])[self.position]
+        aside = np.moveaxis(aside, -2, 0)
+        places = np.concatenate([[z, z], z + aside, z - aside])
+        places[1, ..., self.position] = 0.0
+        values = self._at(places)
+        sizes = np.abs(values) + np.abs(places[..., : self.nx])
+        increments = values - places[..., : self.nx]
+        rounding = _SAME * np.finfo(np.float64).eps * sizes.max(axis=0)
+        alike = (np.abs(increments - increments[0]) <= rounding).all(axis=(0, -1))[..., None]
+        most = sizes[:2].max(axis=-1, keepdims=True)
+        return np.where(alike, places[1], z), np.where(alike, most[1], most[0])
 
     def _stands_at_zero(self, z: FloatArray) -> bool:
         """Whether the function takes a position at zero, without an error of its own."""

@@ -207,7 +207,7 @@ class Model(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """States (count, nx) and inputs (count, nu) about one of each; the same ones each time."""
         rng = np.random.default_rng(0)
-        reach = np.resize([1.0, 0.1, 10.0, 0.01, 100.0, 0.001], count)[:, None]
+        reach = np.resize([1.0, 0.1, 10.0, 0.01, 0.001], count)[:, None]
         states = x + reach * rng.uniform(-1.0, 1.0, (count, self.nx))
         if self.heading is not None:
             states[:, self.heading] = rng.uniform(-np.pi, np.pi, count)
