@@ -10,6 +10,7 @@ deadlines   closed loops among 12 obstacles with a deadline, and how late their 
 optimality  plan costs against the best of 24 starts of IPOPT
 programs    QP solvers on recorded programs
 robots      closed loops of all robots, relative to the double integrator among 5 obstacles
+user_models one robot as a plain function, a CasADi expression and built in
 scenarios   the report's four scenarios, 600 steps each
 ablation    what the parts of the loop and its solver's options are worth
 """
@@ -27,6 +28,7 @@ from benchmarks import (
     robots,
     scaling,
     scenarios,
+    user_models,
 )
 from benchmarks.processes import in_one_thread
 from benchmarks.tables import write
@@ -38,6 +40,7 @@ BENCHMARKS = (
     "optimality",
     "programs",
     "robots",
+    "user_models",
     "scenarios",
     "ablation",
 )
@@ -70,8 +73,8 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], objec
     elif name == "scenarios":
         found = in_one_thread(scenarios.rows)
         write(out, scenarios.NAME, scenarios.markdown(found), {"rows": found}, echo=echo)
-    elif name in ("programs", "ablation"):
-        plain = {"programs": programs, "ablation": ablation}[name]
+    elif name in ("programs", "ablation", "user_models"):
+        plain = {"programs": programs, "ablation": ablation, "user_models": user_models}[name]
         found = in_one_thread(plain.rows, steps)
         write(out, plain.NAME, plain.markdown(found), {"rows": found}, echo=echo)
     else:
