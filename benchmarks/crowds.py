@@ -31,7 +31,6 @@ RUNS = {"dense": 10, "recorded": 3, "reacting": 20}
 PEOPLE = (12, 20)
 DENSE: dict[str, dict[str, Any]] = {"at most 1.8 m/s": {"speed_max": 1.8}, "any speed": {}}
 RECORDED: dict[str, dict[str, Any]] = {"no deadline": {"deadline": None}, "deadline dt": {}}
-REACTING: dict[str, dict[str, Any]] = {"default": {}}
 
 Group = tuple[str, ...]
 
@@ -84,11 +83,9 @@ def _episodes(kind: str, recordings: list[Path]) -> Iterator[tuple[Group, Episod
             episode = dense if kind == "dense" else as_they_were
             yield (name, variant), partial(episode, file=file, options=options)
     if kind == "reacting":
-        for variant, options in REACTING.items():
-            for robot in ROBOTS:
-                for count in PEOPLE:
-                    one = partial(reacting, robot=robot, count=count, options=options)
-                    yield (robot, str(count), variant), one
+        for robot in ROBOTS:
+            for count in PEOPLE:
+                yield (robot, str(count)), partial(reacting, robot=robot, count=count)
 
 
 def progress_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -116,7 +113,7 @@ def markdown(kind: str, rows: list[dict[str, Any]]) -> str:
     """The summary in Markdown, a row for each group."""
     if kind == "reacting":
         names = (
-            "Robot | People | Problem | Arrived | Path to straight line: median, max "
+            "Robot | People | Arrived | Path to straight line: median, max "
             f"| Time: median, max [s] | {CELLS} | Fastest plan [m/s]"
         )
         lines = [
@@ -130,9 +127,12 @@ def markdown(kind: str, rows: list[dict[str, Any]]) -> str:
             )
             for row in rows
         ]
-        return table(names, "lrlrrrrrrrrr", lines)
+        return table(names, "lrrrrrrrrrr", lines)
     what = "Problem" if kind == "dense" else "Time limit"
-    names = f"Scene | {what} | Runs | People at a time | Passes | Mean time of a pass [s] | {CELLS}"
+    names = (
+        f"Scene | {what} | Runs | People at a time "
+        f"| Passes | Mean time of a pass [s] | Way per run [m] | {CELLS}"
+    )
     lines = [
         (
             *row["group"],
@@ -140,11 +140,12 @@ def markdown(kind: str, rows: list[dict[str, Any]]) -> str:
             f"{row['people']:.1f}",
             row["passes"],
             "" if row["pass_mean_s"] is None else f"{row['pass_mean_s']:.1f}",
+            f"{row['way_m']:.0f}",
             *cells(row),
         )
         for row in rows
     ]
-    return table(names, "llrrrrrrrrr", lines)
+    return table(names, "llrrrrrrrrrr", lines)
 
 
 if __name__ == "__main__":

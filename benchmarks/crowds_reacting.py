@@ -143,8 +143,8 @@ def _units(angles: FloatArray) -> FloatArray:
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def problem(robot: str, count: int, options: dict[str, Any]) -> Problem:
-    """Of a robot among that many people; options beyond what is common to all."""
+def problem(robot: str, count: int) -> Problem:
+    """Of a robot among that many people."""
     common: dict[str, Any] = {
         "horizon": HORIZON,
         "R": [0.05, 0.05],
@@ -153,7 +153,6 @@ def problem(robot: str, count: int, options: dict[str, Any]) -> Problem:
         "robot_radius": RADIUS,
         "max_obstacles": count,
         "speed_max": SPEED,
-        **options,
     }
     if robot == "omnidirectional":
         return Problem(DoubleIntegrator(DT), Q=[1.0, 0.1, 1.0, 0.1], **common)
@@ -161,11 +160,9 @@ def problem(robot: str, count: int, options: dict[str, Any]) -> Problem:
     return Problem(Unicycle(DT), Q=[1.0, 1.0, 0.01, 0.1], x_min=[*free, -0.3], **common)
 
 
-def reacting(
-    seed: int, robot: str, count: int, options: dict[str, Any], seconds: float = SECONDS
-) -> dict[str, Any]:
+def reacting(seed: int, robot: str, count: int, seconds: float = SECONDS) -> dict[str, Any]:
     """Cross the square; what happened until the robot arrived, ready for JSON."""
-    run = reacting_run(seed, robot, count, options, seconds)
+    run = reacting_run(seed, robot, count, seconds)
     there = np.linalg.norm(run.positions - GOAL, axis=1) < NEAR
     arrived = bool(there.any())
     end = int(there.argmax()) if arrived else run.steps
@@ -179,11 +176,9 @@ def reacting(
     }
 
 
-def reacting_run(
-    seed: int, robot: str, count: int, options: dict[str, Any], seconds: float = SECONDS
-) -> Run:
+def reacting_run(seed: int, robot: str, count: int, seconds: float = SECONDS) -> Run:
     """The same, as a run; the deadline counts processor time, whatever else the machine does."""
-    task = problem(robot, count, options)
+    task = problem(robot, count)
     return simulate(
         MPC(task, Settings(staleness=StalenessPolicy(keep=0)), timer=process_time),
         Square(task.model, count),

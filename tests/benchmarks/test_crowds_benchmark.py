@@ -132,7 +132,7 @@ def test_a_run_goes_on_where_it_ended(file, tmp_path):
 @pytest.fixture
 def square():
     pytest.importorskip("pyrvo", reason="RVO2 has no wheel for this machine")
-    return Square(problem("omnidirectional", 12, {}).model, 12)
+    return Square(problem("omnidirectional", 12).model, 12)
 
 
 def walked(square, x, steps, seed=0):
@@ -172,14 +172,14 @@ def test_a_seed_is_a_crowd_and_who_arrives_is_left_alone(square):
 @pytest.mark.parametrize("robot", [ROBOTS[1], pytest.param(ROBOTS[0], marks=pytest.mark.slow)])
 def test_a_table_of_people_who_react(robot):
     pytest.importorskip("pyrvo", reason="RVO2 has no wheel for this machine")
-    alone = reacting(0, robot, 0, {}, seconds=16.0)
+    alone = reacting(0, robot, 0, seconds=16.0)
     assert 12.0 < alone["arrived"] < 16.0
     assert alone["ratio"] == pytest.approx(1.0, abs=0.01)
-    short = reacting(0, robot, 3, {}, seconds=1.0)
+    short = reacting(0, robot, 3, seconds=1.0)
     assert short["arrived"] is short["ratio"] is None
     assert short["steps"] == 10
     assert short["fastest_plan"] <= 1 + 1e-6
     rows = [alone, short | {"seed": 1}]
-    text = markdown("reacting", [{"group": (robot, "3", "x"), **summed(rows), **progress_of(rows)}])
-    assert f"| {robot} | 3 | x | 1 of 2 | 1.0" in text
+    text = markdown("reacting", [{"group": (robot, "3"), **summed(rows), **progress_of(rows)}])
+    assert f"| {robot} | 3 | 1 of 2 | 1.0" in text
     assert len({line.count("|") for line in text.split("\n")}) == 1
