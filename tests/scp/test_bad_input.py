@@ -19,7 +19,6 @@ from scp_mpc import (
     QPSettings,
     Settings,
     ShapeError,
-    TooManyObstaclesError,
     Trajectory,
 )
 from scp_mpc.qp.others import installed, known
@@ -45,7 +44,6 @@ BAD_STEPS = [
     ({"x_ref": np.zeros((N, 4))}, ShapeError, "x_ref"),
     ({"x_ref": np.zeros((N + 1, 2))}, ShapeError, "x_ref"),
     ({"x_ref": np.full((N + 1, 4), NAN)}, NotFiniteError, "x_ref"),
-    ({"obstacles": [obstacle(N, (1, 0))] * 2}, TooManyObstaclesError, "max_obstacles = 1"),
     ({"obstacles": [obstacle(N + 1, (1, 0))]}, ShapeError, "obstacles"),
     ({"obstacles": [np.zeros((N + 1, 2))]}, InvalidArgumentError, "obstacles"),
 ]
