@@ -203,19 +203,12 @@ class FunctionModel(ContinuousModel):
         after = x + share * (self.derivative(x, u) - x)
         return Linearisation(after, both[..., : self.nx], both[..., self.nx :])
 
-    def curvature(
-        self,
-        states: FloatArray,
-        inputs: FloatArray,
-        costates: FloatArray,
-        fraction: ArrayLike = 1.0,
+    def _curvature(
+        self, x: FloatArray, u: FloatArray, h: FloatArray, costates: FloatArray
     ) -> FloatArray:
-        """Return sum_k y_k (Hessian of f_k in z), (..., n, n), over that share of an interval."""
         if not self.discrete:
-            return super().curvature(states, inputs, costates, fraction)
-        x, u, h = self._broadcast(states, inputs, fraction)
-        share = h * (self.substeps / self.dt)
-        return self.hessian(x, u, share * costates)
+            return super()._curvature(x, u, h, costates)
+        return self.hessian(x, u, h * (self.substeps / self.dt) * costates)
 
     def stopping_input(self, x: FloatArray) -> FloatArray:
         """Return the input (nu,) by which the position comes to rest."""

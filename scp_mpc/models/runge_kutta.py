@@ -84,12 +84,24 @@ class ContinuousModel(Model):
     ) -> FloatArray:
         """Return sum_k y_k (Hessian of f_k in z), (..., n, n), exactly."""
         x, u, h = self._broadcast(states, inputs, fraction)
+        y = np.broadcast_to(costates, x.shape)
+        weighed = y.any(axis=-1)  # of the nodes within an interval obstacles push few
+        if weighed.all():
+            return self._curvature(x, u, h, y)
+        bent = np.zeros((*weighed.shape, (n := self.nx + self.nu), n))
+        h = np.broadcast_to(h, (*weighed.shape, 1))
+        if weighed.any():
+            bent[weighed] = self._curvature(*(part[weighed] for part in (x, u, h, y)))
+        return bent
+
+    def _curvature(
+        self, x: FloatArray, u: FloatArray, h: FloatArray, costates: FloatArray
+    ) -> FloatArray:
         points, _ = self._march(x, u, h)
         inputs = np.broadcast_to(u, (len(points), *u.shape))
         slopes = self.jacobians(points, inputs)
         W, _ = self._chain(slopes, h[..., None])
-        y = np.broadcast_to(costates, x.shape)
-        m = np.empty_like(points)
+        m, y = np.empty_like(points), costates
         for first in range(len(points) - 4, -1, -4):
             total, after, share = y, y, 0.0
             for i in (3, 2, 1, 0):
