@@ -1,6 +1,7 @@
 """A user's function at many points: in one call where it allows that, else one by one."""
 
 import inspect
+import logging
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -10,6 +11,7 @@ from scp_mpc.arrays import FloatArray, as_array
 from scp_mpc.errors import InvalidArgumentError, ShapeError
 
 Layout = Literal["any", "rows", "columns", "single"]
+_log = logging.getLogger(__name__)
 _MANY = 600  # points of the trial; norms and the like over all of them give themselves away
 _ALIKE = 1e-9  # relative difference of values that count as the same: array and scalar sines differ
 
@@ -108,6 +110,7 @@ class Batched:
                 ):
                     return
         self.layout = "single"
+        _log.info("%s takes one point at a time, which is slower: numpy, no branches?", self._name)
 
     def _read(self, value: Any, columns: bool = False) -> Any:
         """A value as an array: the parts of a pair side by side, constants as often as need be."""
