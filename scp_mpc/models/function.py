@@ -64,7 +64,7 @@ class FunctionModel(ContinuousModel):
         stopping_input: x (nx,) to the input (nu,) that stops it; if None, least squares over an
             interval.
         state: Positions and velocities (..., d) to states (..., nx); if None, least squares.
-        check: Compare the Jacobians with differences of g: True at 24 random states and inputs
+        check: Compare the Jacobians with differences of g: True at 30 random states and inputs
             about zero and `equilibrium_input`, see `Model.check`; or about a given state (nx,) and
             input (nu,), say at the origin of a map; or at given points (..., nx), (..., nu) and no
             others. The shapes are always checked.

@@ -157,9 +157,9 @@ class Model(ABC):
     ) -> None:
         """Compare the derivatives, second ones included, with differences.
 
-        One state and input, or None, stand for 24 random ones about them, too, in one call and the
-        same ones each time: off by up to 0.1, 1 or 10 in each entry, headings by any angle. There
-        a model need not be finite. An entry is wrong if it is off by more than a share of itself,
+        One state and input, or None, stand for 30 random ones about them, too, in one call and the
+        same ones each time: off by up to 0.001, ... 1 or 10 in each entry, headings at any angle.
+        There a model need not be finite. An entry is wrong if it is off by more than a share of itself,
         by more than rounding, and by more than the spread of three differences explain.
 
         Args:
