@@ -260,7 +260,8 @@ class FunctionModel(ContinuousModel):
         near = z.copy()
         near[self.position] = 0.0
         try:
-            return bool(np.isfinite(self._at(near)).all())
+            with np.errstate(all="ignore"):
+                return bool(np.isfinite(self._at(near)).all())
         except Exception:
             return False
 

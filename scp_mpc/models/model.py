@@ -159,8 +159,8 @@ class Model(ABC):
 
         One state and input, or None, stand for 30 random ones about them, too, in one call and the
         same ones each time: off by up to 0.001, ... 1 or 10 in each entry, headings at any angle.
-        There a model need not be finite. An entry is wrong if it is off by more than a share of itself,
-        by more than rounding, and by more than the spread of three differences explain.
+        There a model need not be finite. An entry is wrong if it is off by more than a share of
+        itself, by more than rounding, and by more than the spread of three differences explain.
 
         Args:
             x: (nx,) or (..., nx); None for random ones about zero.
