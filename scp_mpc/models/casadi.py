@@ -7,17 +7,61 @@ Notation:
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import FloatArray, as_count
 from scp_mpc.errors import InvalidArgumentError, MissingExtraError, ShapeError
 from scp_mpc.models.function import FunctionModel
-from scp_mpc.models.model import joined
+from scp_mpc.models.model import Linearisation, joined
+
+_MOST_SIZES = 64  # numbers of points for which buffers are kept
+
+
+class Mapped:
+    """A CasADi function at many points at once, from and to numpy's arrays.
+
+    Args:
+        function: Of columns; its values dense.
+        shapes: Of its values at one point, as numpy has them: CasADi's memory runs by columns.
+    """
+
+    def __init__(self, function: Any, *shapes: tuple[int, ...]) -> None:
+        """Nothing is evaluated yet."""
+        self._function, self._shapes = function, shapes
+        self._idle: defaultdict[int, list[Any]] = defaultdict(list)  # by number of points
+
+    def __reduce__(self) -> Any:
+        """Copies make buffers of their own."""
+        return Mapped, (self._function, *self._shapes)
+
+    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
+        """Return values (..., *shape), one per shape, at points (..., size)."""
+        lead = arguments[0].shape[:-1]
+        found = [np.empty((*lead, *shape)) for shape in self._shapes]
+        count = math.prod(lead)
+        if not count:
+            return found
+        # a buffer knows addresses only: copies have to live until it is evaluated
+        points = [np.ascontiguousarray(part, dtype=np.float64) for part in arguments]
+        if len(self._idle) > _MOST_SIZES:
+            self._idle.clear()
+        idle = self._idle[count]
+        try:
+            buffer, evaluate = idle.pop()  # no two threads get the same
+        except IndexError:
+            buffer, evaluate = self._function.map(count).buffer()
+        for i, part in enumerate(points):
+            buffer.set_arg(i, part.data)
+        for i, part in enumerate(found):
+            buffer.set_res(i, part.data)
+        evaluate()
+        idle.append((buffer, evaluate))
+        return found
 
 
 class CasadiModel(FunctionModel):
@@ -65,8 +109,10 @@ class CasadiModel(FunctionModel):
     ) -> None:
         """Differentiate, and check everything that can be checked."""
         dynamics = _dynamics(function, x, u)
-        nx, nu = self._nx, self._nu = dynamics.size1_in(0), dynamics.size1_in(1)
-        self._rates, self._jacobian, self._hessian = _differentiated(dynamics, nx, nu)
+        nx, nu = dynamics.size1_in(0), dynamics.size1_in(1)
+        self._rates, self._gradient, self._bend, self._after, self._sensitivity = _differentiated(
+            dynamics, as_count("substeps", substeps), bool(discrete)
+        )
         super().__init__(
             self._called,
             nx=nx,
@@ -89,17 +135,35 @@ class CasadiModel(FunctionModel):
 
     def jacobians(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return dg/dz (..., nx, nx+nu) at states (..., nx) and inputs (..., nu)."""
-        return _mapped(self._jacobian, (self.nx, self.nx + self.nu), joined(states, inputs))
+        return self._gradient(joined(states, inputs))[0]
 
     def hessian(self, states: FloatArray, inputs: FloatArray, weights: FloatArray) -> FloatArray:
         """Return sum_k m_k (Hessian of g_k in z), (..., n, n), for weights m (..., nx)."""
         z = joined(states, inputs)
-        return _mapped(
-            self._hessian, (z.shape[-1],) * 2, z, np.broadcast_to(weights, (*z.shape[:-1], self.nx))
-        )
+        return self._bend(z, np.broadcast_to(weights, (*z.shape[:-1], self.nx)))[0]
+
+    def advance(
+        self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
+    ) -> FloatArray:
+        """Return the states (..., nx) after a share of an interval with the input held."""
+        return self._after(*self._held(states, inputs, fraction))[0]
+
+    def linearise(
+        self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike = 1.0
+    ) -> Linearisation:
+        """Return `advance` with its derivatives; arguments as there."""
+        after, both = self._sensitivity(*self._held(states, inputs, fraction))
+        return Linearisation(after, both[..., : self.nx], both[..., self.nx :])
 
     def _called(self, states: FloatArray, inputs: FloatArray) -> FloatArray:
-        return _mapped(self._rates, (self.nx,), joined(states, inputs))
+        return self._rates(joined(states, inputs))[0]
+
+    def _held(
+        self, states: FloatArray, inputs: FloatArray, fraction: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        x, u, h = self._broadcast(states, inputs, fraction)
+        h = h * (self.substeps / self.dt) if self.discrete else h
+        return joined(x, u), np.broadcast_to(h, (*x.shape[:-1], 1))
 
 
 def _dynamics(function: Any, x: Any, u: Any) -> Any:
@@ -133,45 +197,46 @@ def _dynamics(function: Any, x: Any, u: Any) -> Any:
     return function
 
 
-def _differentiated(function: Any, nx: int, nu: int) -> tuple[Any, Any, Any]:
-    """Functions of z: g (nx,), its transposed Jacobian (n, nx), and of m, too, a Hessian (n, n)."""
+def _differentiated(function: Any, substeps: int, discrete: bool) -> tuple[Mapped, ...]:
+    """Functions of z: g, dg/dz, and of m, too, a Hessian; of h, too, f, and f with its derivative.
+
+    Of a continuous robot h is the time of one substep, of a discrete one the share of an interval.
+    """
     import casadi
 
-    symbol: Any
+    nx, nu = function.size1_in(0), function.size1_in(1)
+    n = nx + nu
+    symbol: Any = casadi.SX.sym
     try:
         try:
-            function, symbol = function.expand(), casadi.SX.sym
+            function = function.expand()
         except RuntimeError:  # not made of scalar operations
             symbol = casadi.MX.sym
-        z, m = symbol("z", nx + nu), symbol("m", nx)
-        g = function(z[:nx], z[nx:])
+        z, m, h = symbol("z", n), symbol("m", nx), symbol("h", 1)
+        x, u = z[:nx], z[nx:]
+        g, after = function(x, u), x
+        if discrete:
+            after = x + h * (g - x)
+        for _ in range(0 if discrete else substeps):
+            k1 = function(after, u)
+            k2 = function(after + h / 2 * k1, u)
+            k3 = function(after + h / 2 * k2, u)
+            k4 = function(after + h * k3, u)
+            after = after + h / 6 * (k1 + 2 * (k2 + k3) + k4)
         weighed = casadi.hessian(casadi.dot(m, g), z)[0]
+        slopes, sensitivity = (casadi.jacobian(value, z).T for value in (g, after))
+
+        def mapped(arguments: list[Any], values: list[Any], *shapes: tuple[int, ...]) -> Mapped:
+            dense = [casadi.densify(value) for value in values]
+            return Mapped(casadi.Function("f", arguments, dense), *shapes)
+
         return (
-            casadi.Function("g", [z], [casadi.densify(g)]),
-            casadi.Function("J", [z], [casadi.densify(casadi.jacobian(g, z).T)]),
-            casadi.Function("H", [z, m], [casadi.densify(weighed)]),
+            mapped([z], [g], (nx,)),
+            mapped([z], [slopes], (nx, n)),
+            mapped([z, m], [weighed], (n, n)),
+            mapped([z, h], [after], (nx,)),
+            mapped([z, h], [after, sensitivity], (nx,), (nx, n)),
         )
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]
         raise InvalidArgumentError("function", f"has no derivatives ({reason})") from None
-
-
-@lru_cache(maxsize=256)
-def _many(function: Any, count: int) -> Any:
-    """A function of so many points; a solver asks for few counts, and it takes 60 us to make."""
-    return function.map(count)
-
-
-def _mapped(function: Any, shape: tuple[int, ...], *arguments: FloatArray) -> FloatArray:
-    """Values (..., *shape) at points (..., size): CasADi's memory runs by columns."""
-    lead = arguments[0].shape[:-1]
-    values = np.empty((*lead, *shape))
-    if values.size:
-        # the buffer knows addresses only: copies have to live until it is evaluated
-        points = [np.ascontiguousarray(part, dtype=np.float64) for part in arguments]
-        buffer, evaluate = _many(function, math.prod(lead)).buffer()
-        for i, part in enumerate(points):
-            buffer.set_arg(i, part.data)
-        buffer.set_res(0, values.data)
-        evaluate()
-    return values
