@@ -94,7 +94,7 @@ class Loop:
                 planes = nominal.planes if own else wider.planes(planes.y)
                 continue
             accepted = region.accepts(nominal, reached, trial, program, convex, solution)
-            if not accepted and not at.linear:
+            if not accepted and not at.linear and len(trial.force):
                 solution = second_order_correction(program, solution, trial)
                 trial = at.certify(program, solution)
                 accepted = region.accepts(nominal, reached, trial, program, convex, solution)

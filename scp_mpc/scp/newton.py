@@ -17,6 +17,9 @@ lead away from this point, and there is nothing to sum.
 Where the dynamics bend, too, the second derivative of the Lagrangian is I + W with any symmetric W,
 and Newton's step goes on from the convex one within the null space of A: P (I + W) P z = -P W d.
 
+Where Newton's step would leave the active set, the program is solved again with that second
+derivative for its Hessian, negative curvature replaced by a little that is positive.
+
 Notation:
     d   (nv,)       step of the condensed problem
     A   (k, nv)     responses of the active constraints
@@ -27,32 +30,42 @@ Notation:
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg.lapack import dposv, dpotrs, dtrtrs
+from scipy.linalg.lapack import dposv, dpotrf, dpotrs, dtrtrs
 
 from scp_mpc.arrays import FloatArray
-from scp_mpc.qp.active_set import QPSolution, holds, settled
+from scp_mpc.qp.active_set import CondensedQP, QPSolution, holds, settled
 from scp_mpc.scp.certificate import CURVATURE_TOLERANCE, Nominal
 from scp_mpc.scp.transcription import Program, Transcription
 
 _STEPS = (0.5, 0.1, 0.02)  # of the inputs' range, to leave a saddle
 _LESS = 1e-9  # relative fall of the merit that is none
+_FLAT = 0.1  # least curvature of a program, relative to that of the cost
+_CHANGES = 30  # of the active set, in a program with the Lagrangian's Hessian
 _RESTORATIONS, _MOST = 3, 100  # steps, and changes of the active set in each
 
 
 def refined(at: Transcription, program: Program, solution: QPSolution) -> QPSolution:
-    """Go on from a convex step to Newton's, if its active set carries that far."""
-    condensed, nf = program.condensed, len(program.qp.F)
+    """Go on from a convex step to Newton's: on its active set, or else with one that changes."""
+    qp, here, nf = program.qp, program.condensed.here, len(program.qp.F)
     if at.linear:
         factors, push, L = at.curvature_factors(program, solution.force[nf:])
         if not len(push):
             return solution
-        moved = condensed.y(solution.v) - program.planes.y
+        moved = program.condensed.y(solution.v) - program.planes.y
         turned = np.einsum("kwm,kw->km", L, moved[program.pairs.at[push]])
         whole = summed(solution, factors, turned.ravel())
     else:
         W = at.curvature(program, solution)
-        whole = newton_step(solution, solution.v - condensed.here, W)
-    return whole if whole is not None and holds(program.qp, whole) else solution
+        whole = newton_step(solution, solution.v - here, W)
+    if whole is not None and holds(qp, whole):
+        return whole
+    if at.linear:
+        _, roots, vectors = np.linalg.svd(factors, full_matrices=False)
+        values, vectors = 1.0 - roots * roots, vectors.T
+    else:
+        values, vectors = np.linalg.eigh(W)
+        values += 1.0
+    return newton_program(qp, here, values, vectors, solution) or solution
 
 
 def second_order_correction(program: Program, solution: QPSolution, trial: Nominal) -> QPSolution:
@@ -148,6 +161,42 @@ def newton_step(solution: QPSolution, step: FloatArray, W: FloatArray) -> QPSolu
         change, _ = dpotrs(solution.factor, solution.rows @ (W @ (step + z)))
         force[solution.indices] += change
     return replace(solution, v=solution.v + z, force=force)
+
+
+def newton_program(
+    qp: CondensedQP,
+    here: FloatArray,
+    values: FloatArray,
+    vectors: FloatArray,
+    solution: QPSolution,
+) -> QPSolution | None:
+    """Solve a program again with the Lagrangian's own Hessian H; None where that is not reached.
+
+    For where the active set changes on the way of Newton's step. With C = H^(1/2), curvatures that
+    are negative or small replaced, the objective is |w|^2 / 2 in w = C (v - here) + C^-1 here, so
+    that the program is of the same kind.
+
+    Args:
+        qp: The convex program.
+        here: (nv,) the point about which it was made.
+        values: (q,) eigenvalues of H; all others are one.
+        vectors: (nv, q) their eigenvectors.
+        solution: Of the convex program: the active set to begin with.
+    """
+    stretch = 1 / np.sqrt(np.maximum(values, _FLAT)) - 1
+    back = (vectors * stretch) @ vectors.T  # C^-1
+    back.flat[:: len(back) + 1] += 1.0
+    origin = here - back @ (back @ here)
+    nf, moved = len(qp.F), qp.rows @ origin
+    turned = replace(
+        qp, F=qp.F @ back, A=qp.A @ back, lower=qp.lower - moved[:nf], upper=qp.upper - moved[:nf],
+        b=qp.b - moved[nf:],
+    )  # fmt: skip
+    end = settled(turned, solution.active, solution.relaxed, _CHANGES).solution
+    if end is None:
+        return None
+    rows = qp.rows[end.indices]
+    return replace(end, v=origin + back @ end.v, rows=rows, factor=dpotrf(rows @ rows.T)[0])
 
 
 def negative_curvature_step(

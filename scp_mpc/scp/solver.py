@@ -337,17 +337,19 @@ class SCP:
                 others = [at.plain(inputs) for inputs in self._starts()]
             for other in others:
                 end = self._loop.run(other, found)
-                found = end if end is not None and end.beats(found, _BETTER * found.merit) else found
+                found = (
+                    end if end is not None and end.beats(found, _BETTER * found.merit) else found
+                )
             plan = found.nominal or start
         return plan
 
     def _starts(self) -> list[FloatArray]:
-        """Inputs (N, nu) that lead near some local optima each: the best manoeuvres, and rest."""
+        """Inputs (N, nu) that lead near some local optima each: rest, and the best manoeuvres."""
         at, clock, rest = self._at, self._at.clock, self.problem.model.equilibrium_input
         starts = [np.tile(rest, (self.problem.horizon, 1))]
         if not at.linear and clock.allows("manoeuvres"):
             with clock.task("manoeuvres"):
-                starts = [*manoeuvres(at.step, _MANOEUVRES), *starts]
+                starts.extend(manoeuvres(at.step, _MANOEUVRES))
         return starts
 
     def _stands(self, plan: Result) -> bool:

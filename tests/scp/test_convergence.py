@@ -13,8 +13,8 @@ from instances import KINDS, S_REF, instance
 from nonlinear_cases import DRAG, DT, MODELS, SIZE, ride
 from nonlinear_cases import KINDS as RIDES
 from referee import Referee
-from benchmarks.peers.referee import ModelReferee
 
+from benchmarks.peers.referee import ModelReferee
 from scp_mpc import SCP, Settings, Status, Trajectory
 from scp_mpc.trajectory import rollout
 

@@ -6,11 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from instances import DT, KINDS, S_REF, instance, obstacle, problem, straight_reference
+from qpsolvers import solve_qp
+from scipy.sparse import csc_array
 
 from scp_mpc import (
     SCP,
     DoubleIntegrator,
     ObstaclePrediction,
+    Problem,
     Settings,
     Status,
     Trajectory,
@@ -19,10 +22,11 @@ from scp_mpc.deadline import Clock
 from scp_mpc.geometry import NoGoSets
 from scp_mpc.geometry.inflation import AxesInflation, ExactInflation
 from scp_mpc.geometry.tangent_basis import inverse_root, tangents
+from scp_mpc.models import Unicycle
 from scp_mpc.qp.active_set import CondensedQP, settled
 from scp_mpc.scp import loop
 from scp_mpc.scp.loop import Loop
-from scp_mpc.scp.newton import newton_step, summed
+from scp_mpc.scp.newton import newton_program, newton_step, summed
 from scp_mpc.scp.nodes import Nodes
 from scp_mpc.scp.step import Step
 from scp_mpc.scp.transcription import Transcription
@@ -63,6 +67,44 @@ def test_there_is_no_sum_where_the_steps_grow():
     held, L, d, P = bent(3.0)
     assert np.abs(np.linalg.eigvals(P @ L.T @ L)).max() > 1
     assert summed(held, L, L @ (P @ d)) is None
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_program_with_another_hessian_is_solved(seed):
+    """Against a solver of quadratic programs; from the active set of the one with the identity."""
+    rng = np.random.default_rng(seed)
+    n, k = 6, 5
+    A, here = rng.normal(size=(k, n)), rng.normal(size=n)
+    b = A @ here - rng.uniform(0.0, 1.5, k)
+    F = np.vstack([np.eye(n), rng.normal(size=(3, n))])
+    width = rng.uniform(0.5, 2.0, (2, len(F)))
+    p = CondensedQP(F, F @ here - width[0], F @ here + width[1], A, b, np.eye(n))
+    convex = settled(p, np.zeros(9 + k, int), np.zeros(9 + k, dtype=bool), 100).solution
+    values, vectors = rng.uniform(-1.0, 4.0, n), np.linalg.qr(rng.normal(size=(n, n)))[0]
+    if seed % 2:  # all other curvatures are one
+        values, vectors = values[:2], vectors[:, :2]
+    H = np.eye(n) + (vectors * (np.maximum(values, 0.1) - 1.0)) @ vectors.T
+    found = newton_program(p, here, values, vectors, convex)
+    G, h = np.vstack([F, -F, -A]), np.concatenate([p.upper, -p.lower, -b])
+    best = solve_qp(csc_array(H), here - H @ here, csc_array(G), h, solver="clarabel")
+    np.testing.assert_allclose(found.v, best, atol=1e-4)  # an interior point
+    push = found.force @ np.vstack([F, A])
+    np.testing.assert_allclose(here + H @ (found.v - here), push, atol=1e-8)
+    np.testing.assert_allclose(found.factor.T @ found.factor, found.rows @ found.rows.T, atol=1e-9)
+    assert (found.force[found.active == 0] == 0).all()
+
+
+def test_a_robot_that_turns_before_it_drives_is_planned_for_in_a_few_iterations():
+    """Bounds come and go on the way; convex steps alone, which do not bend, end uncertified."""
+    limit = np.array([np.inf, np.inf, np.inf, 1.5])
+    turns = Problem(
+        Unicycle(0.1), horizon=30, Q=[1, 1, 0.01, 0.05], R=[0.02] * 2, u_min=-2.0, u_max=2.0,
+        x_min=-limit, x_max=limit,
+    )  # fmt: skip
+    for goal in ([-2.0, 1.0], [0.5, -3.0], [-1.0, -0.2], [2.0, 2.0]):
+        plan = SCP(turns, Settings(history=True)).solve(np.zeros(4), [*goal, 0.0, 0.0])
+        assert plan.status is Status.CONVERGED
+        assert len(plan.history) <= 12
 
 
 @pytest.mark.parametrize("dim", [2, 3])

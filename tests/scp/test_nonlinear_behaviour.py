@@ -293,7 +293,7 @@ def test_a_search_that_ends_early_hands_out_a_plan_that_can_be_followed():
     restored = driving = 0
     for seed in range(5):
         this, x0, goal, things = hurried(seed)
-        for most in (10, 20):
+        for most in (4, 7):
             plan = SCP(this, Settings(max_iterations=most)).solve(x0, goal, things)
             if plan.status is Status.FEASIBLE:
                 gaps = [np.linalg.norm(plan.X[1:, :2] - o.means[1:], axis=1) for o in things]

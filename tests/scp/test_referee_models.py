@@ -8,8 +8,8 @@ import pytest
 from instances import DT, instance, obstacle, rotated
 from models import OWN, draw
 from referee import Referee
-from benchmarks.peers.referee import ModelReferee, symbolic
 
+from benchmarks.peers.referee import ModelReferee, symbolic
 from scp_mpc import SCP, Containment, DoubleIntegrator, ObstaclePrediction, Problem, Settings
 from scp_mpc.models import Unicycle
 from scp_mpc.trajectory import rollout

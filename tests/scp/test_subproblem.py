@@ -192,8 +192,10 @@ def converged(name, kind):
     scp = SCP(case.problem, Settings(tolerance=1e-9, max_iterations=200))
     given = case.x0, case.x_ref, case.obstacles
     plan = scp.solve(*given)
-    assert plan.status.certified
-    if not plan.ok and -plan.multipliers.obstacles.min() > case.problem.slack_weight:
+    if not plan.status.certified:
+        assert plan.status is Status.STOPPING  # the plan with slack is faster than braking
+        program = None
+    elif not plan.ok and -plan.multipliers.obstacles.min() > case.problem.slack_weight:
         program = None  # states yielded while obstacles held, with more than an elastic one allows
     else:
         program = scp.subproblem(*given, guess=plan.iterate, elastic=not plan.ok)
