@@ -22,7 +22,7 @@ def build(robot):
 def test_wrong_entries_are_found_and_right_models_kept():
     """Units of m, mm and km, dt from 0.01 to 1 s, coordinates of a map; one entry wrong."""
     rng = np.random.default_rng(7)
-    for _ in range(60):
+    for _ in range(25):
         robot = draw_robot(rng, wrong=True)
         with pytest.raises(JacobianError) as caught:
             build(robot)

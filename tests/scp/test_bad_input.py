@@ -20,6 +20,7 @@ from scp_mpc import (
     Settings,
     ShapeError,
     Trajectory,
+    Unicycle,
 )
 from scp_mpc.qp.others import installed, known
 
@@ -94,7 +95,8 @@ def test_bad_predictions_are_refused(arguments, error, message):
         ({"horizon": 0}, BoundsError, "horizon"),
         ({"horizon": 2.5}, InvalidArgumentError, "horizon"),
         ({"horizon": True}, InvalidArgumentError, "horizon"),
-        ({"margin": 2.4}, InvalidArgumentError, "margin"),
+        ({"margin": 2.4}, InvalidArgumentError, r"Margin\(reference=2.4, lower=2.4\)"),
+        ({"model": Unicycle(0.2), "R": [1.0, 0.0]}, InvalidArgumentError, "R: is singular"),
         ({"inflation": []}, InvalidArgumentError, "inflation"),
         ({"max_obstacles": 0.0}, InvalidArgumentError, "max_obstacles"),
         ({"Q": [1.0, 1.0]}, ShapeError, "Q"),
