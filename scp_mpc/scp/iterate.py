@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from scp_mpc.arrays import BoolArray, FloatArray, require_finite
+from scp_mpc.arrays import BoolArray, FloatArray, frozen, require_finite
 from scp_mpc.errors import InvalidArgumentError, ShapeError
 from scp_mpc.models.model import Model
 from scp_mpc.problem import Problem
@@ -102,6 +102,18 @@ class Iterate:
         for array in (self.states, self.inputs, self.s, self.slack, *duals):
             array.setflags(write=False)
         return self
+
+    def unwrapped(self, model: Model, x0: FloatArray) -> "Iterate":
+        """Return the iterate with its heading within half a turn of that of a state (nx,) now."""
+        if model.heading is None:
+            return self
+        turns = np.rint((x0[model.heading] - self.states[0, model.heading]) / (2 * np.pi))
+        if not turns:
+            return self
+        states, free = self.states.copy(), self.obstacle_free
+        states[:, model.heading] += 2 * np.pi * turns
+        free = None if free is None else free.unwrapped(model, x0)
+        return replace(self, states=frozen(states), obstacle_free=free)
 
     def shifted(self, model: Model) -> "Iterate":
         """Return the iterate one step later: the last input is held, its end state appended."""

@@ -52,6 +52,7 @@ _CORRECTIONS = 4  # of what was assumed about the motion between nodes
 _WARM_UP = 3  # steps
 _MANOEUVRES = 2  # that are followed
 _BETTER = 1e-3  # share of the merit by which one has to win
+_SPARE = 10  # iterations for which there has to be time
 
 
 class SCP:
@@ -150,6 +151,8 @@ class SCP:
             step = Step.read(
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
             )
+            if nominal is not None:
+                nominal = nominal.unwrapped(self.problem.model, step.x0)
             try:
                 return self._solve(step, clock, nominal, multi_start, brake_first)
             except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
@@ -336,10 +339,11 @@ class SCP:
             if last is not None and self._stands(found):
                 others = [at.plain(inputs) for inputs in self._starts()]
             for other in others:
+                if at.clock.room("iteration", _SPARE) < _SPARE:
+                    break
                 end = self._loop.run(other, found)
-                found = (
-                    end if end is not None and end.beats(found, _BETTER * found.merit) else found
-                )
+                if end is not None and end.beats(found, _BETTER * found.merit):
+                    found = end
             plan = found.nominal or start
         return plan
 

@@ -18,7 +18,7 @@ from scp_mpc import (
     Trajectory,
 )
 
-SETTINGS = Settings(multi_start=False, max_iterations=100)
+SETTINGS = Settings(multi_start=False, max_iterations=100, deadline=None)
 
 
 def as_function(model):

@@ -22,7 +22,7 @@ from scp_mpc.report.canvas import HALF_PLANE
 from scp_mpc.simulation import SCENARIOS
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "see_scp_at_work.py"
-KEPT = Settings(history=True)
+KEPT = Settings(history=True, deadline=None)
 
 
 def planned(nodes=1, settings=KEPT, obstacle=None):

@@ -27,7 +27,7 @@ from scp_mpc.scp import Multipliers
 
 NAN, INF = np.nan, np.inf
 N = 8
-PIQP = Settings(solver="piqp")
+PIQP = Settings(solver="piqp", deadline=None)
 SPEED = {"x_max": [INF, 2.0, INF, 1.5], "x_min": [-INF, -2.0, -INF, -INF]}
 
 

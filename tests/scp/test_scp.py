@@ -22,7 +22,7 @@ from scp_mpc.qp.osqp import OSQP
 from scp_mpc.scp import KKTResiduals
 from scp_mpc.scp.plan import Result, judge
 
-KEEP_SIDE = Settings(multi_start=False)
+KEEP_SIDE = Settings(multi_start=False, deadline=None)
 SOLVERS = pytest.mark.parametrize("solver", ["osqp", "piqp"])
 
 
@@ -189,7 +189,7 @@ def test_running_out_of_iterations_is_said_so():
     assert plan.kkt.worst > 1e-6
 
 
-DEAD = Settings(qp=QPSettings(iterations=(1,), repairs=(0,), rescue=False))
+DEAD = Settings(deadline=None, qp=QPSettings(iterations=(1,), repairs=(0,), rescue=False))
 
 
 def test_without_any_solution_the_robot_brakes_within_limits():
