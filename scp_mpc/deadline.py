@@ -152,8 +152,8 @@ class Clock:
         if self._deadline == inf:
             return most
         after = self._pace.expected(then) + self._pace.expected("ending")
-        spare = self._deadline - self.elapsed() - after
-        times = min(most, int(max(spare, 0.0) / max(self._pace.expected(task), _LEAST)))
+        left = self._deadline - self.elapsed() - after
+        times = min(most, int(max(left, 0.0) / max(self._pace.expected(task), _LEAST)))
         if times < most:
             self._pace.refused(task, after + self._pace.expected(task) > self._deadline)
         return times
