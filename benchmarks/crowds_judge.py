@@ -33,9 +33,9 @@ def judged(run: Run, steps: int | None = None) -> dict[str, Any]:
         "steps": end,
         "contacts": [
             asdict(contact)
-            | {"status": plans[int(contact.time / run.problem.model.dt)].status.name}
+            | {"status": statuses[min(int(contact.time / run.problem.model.dt), end - 1)]}
             for contact in find_contacts(run)
-            if contact.time < run.times[end]
+            if contact.time <= run.times[end]
         ],
         "beyond": {
             "input": _beyond(inputs, run.problem.u_min, run.problem.u_max),

@@ -103,13 +103,16 @@ def find_contacts(run: Run) -> list[Contact]:
     apart = int(np.ceil(_APART / run.problem.model.dt * FINE))
     for body in np.flatnonzero((run.clearances <= 0).any(axis=0)):
         within = run.gaps(int(body))
-        # an interval's end begins the next one
+        # an interval's end begins the next one, unless the body is gone by then
         gaps = np.concatenate([within[:-1].T.ravel(), within[-1, -1:]])
+        gaps[FINE::FINE] = np.minimum(gaps[FINE::FINE], within[-1])
         touching = np.flatnonzero(gaps <= 0)
         for event in np.split(touching, np.flatnonzero(np.diff(touching) > apart) + 1):
             depth = -float(gaps[event[0] : event[-1] + 1].min())
-            first = min(int(event[0]), run.steps * FINE - 1)
-            found.append(_contact(run, int(body), *divmod(first, FINE), depth))
+            step, piece = divmod(int(event[0]), FINE)
+            if step == run.steps or within[piece, step] > 0:
+                step, piece = step - 1, FINE
+            found.append(_contact(run, int(body), step, piece, depth))
     return sorted(found, key=lambda contact: contact.time)
 
 

@@ -156,6 +156,18 @@ def test_two_contacts_with_one_body_are_two():
     assert [contact.kind for contact in find_contacts(still)] == ["at rest", "at rest"]
 
 
+@pytest.mark.parametrize("steps", [5, 6, 9], ids=["run ends", "body leaves", "later"])
+def test_a_contact_at_the_end_of_the_last_interval_counts(steps):
+    """One that is reached at 0.5 s, when the body is seen for the last time."""
+    body = Body(lambda t: [np.nan, np.nan] if t > 0.55 else [1.099 - t, 0.0], 0.3)
+    scene = Scene(np.zeros(4), np.zeros(4), [body])
+    run = simulate(Blind(POINT, [0.0, 0.0]), scene, sensor=TrackedSensor(), steps=steps)
+    (contact,) = find_contacts(run)
+    assert (contact.time, contact.seen) == (pytest.approx(0.5), pytest.approx(0.4))
+    assert contact.depth == pytest.approx(0.001)
+    assert (contact.kind, contact.body_closing) == ("at rest", pytest.approx(1.0))
+
+
 def test_bodies_check_themselves():
     with pytest.raises(BoundsError, match="radius"):
         Body([0.0, 0.0], -0.1)
