@@ -26,7 +26,7 @@ SECONDS, NEAR, STAY = 20.0, 0.3, 1.0  # a drive ends after so long, or so near t
 _SEEK = 1.0  # [s] after which the path is sought again
 _STANDING = 0.3, 0.0  # [m/s] up to which a thing is in the way; the last where there is no way else
 _SPEED = 2.0  # [m/s] along a path of who knows no limit
-_ACCELERATIONS = 1.0, 1.0  # [m/s^2] across a path and along it
+_ACCELERATION = 1.0  # [m/s^2] along a path
 
 
 class Controller(Protocol):
@@ -91,7 +91,8 @@ class Way:
 
     def __init__(self, world: World) -> None:
         """Nothing is known yet."""
-        self._world, self._limits = world, SpeedLimits(world.speed_max or _SPEED, *_ACCELERATIONS)
+        self._world = world
+        self._limits = SpeedLimits(world.speed_max or _SPEED, longitudinal=_ACCELERATION)
         self._follow: PathReference | None = None
 
     def states(self, x: FloatArray, k: int) -> FloatArray:

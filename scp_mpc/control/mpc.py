@@ -25,6 +25,7 @@ from scp_mpc.deadline import Clock, Timer
 from scp_mpc.errors import ConcurrentUseError, TooManyObstaclesError
 from scp_mpc.obstacles.prediction import ObstaclePrediction, require_fitting
 from scp_mpc.problem import ROUNDING, Problem
+from scp_mpc.scp.braking import AT_REST
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
@@ -32,6 +33,9 @@ from scp_mpc.scp.step import Step
 from scp_mpc.settings import Settings
 
 _log = logging.getLogger(__name__)
+
+_AFRESH = 10  # steps of standing where it is not to be, after which a plan is sought afresh
+_BETTER = 0.999  # of the cost of standing: less than that is better
 
 
 class MPC:
@@ -71,7 +75,7 @@ class MPC:
         self._last: Iterate | None = None
         self._applied: FloatArray | None = None
         self._backup: FloatArray | None = None
-        self._steps_touching = 0
+        self._steps_touching = self._steps_standing = 0
         self._obstacles: tuple[ObstaclePrediction, ...] = ()
         self._counts.clear()
         self.overruns = self.replayed = self._left_out = 0
@@ -222,11 +226,14 @@ class MPC:
     ) -> Plan:
         if recall.stale is None:
             due = self._steps_touching % self.settings.multi_start_interval == 0
-            return self._solver.solve_from(
-                *(x0, x_ref, recall.obstacles, self.nominal(), due),
-                *(robot_covariance, clock, last),
-                brake_first=self.replayed >= self.settings.max_replayed,
-            )
+            given, rest = (x0, x_ref, recall.obstacles), (robot_covariance, clock, last)
+            late = self.replayed >= self.settings.max_replayed
+            plan = self._solver.solve_from(*given, self.nominal(), due, *rest, brake_first=late)
+            if self._is_stuck(plan) and clock.allows("iteration"):
+                other = self._solver.solve_from(*given, None, True, *rest)
+                if other.ok and (not plan.ok or other.cost < _BETTER * plan.cost):
+                    return other
+            return plan
         if self.settings.staleness.beyond == "refuse":
             raise recall.stale
         # Bad arguments are refused before the robot brakes.
@@ -257,6 +264,14 @@ class MPC:
         other = replace(other, iterate=replace(other.iterate, obstacle_free=free))
         return replace(other, qps=plan.qps, timing=plan.timing), self._backup[1:]
 
+    def _is_stuck(self, plan: Plan) -> bool:
+        """Whether to look for a plan from nothing: the last one may be a bad optimum to stand in.
+
+        After so many steps of standing, and after twice as many each time.
+        """
+        times, rest = divmod(self._steps_standing, _AFRESH)
+        return times > 0 and not rest and times & (times - 1) == 0 and _stands(plan)
+
     def _within(self, plan: Plan, last: FloatArray | None) -> bool:
         lower, upper = self.problem.u_min, self.problem.u_max
         within = (lower <= plan.u0) & (plan.u0 <= upper)  # False for NaN
@@ -278,6 +293,8 @@ class MPC:
         self._last, self._applied = start, plan.u0
         self._obstacles = recall.obstacles
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
+        stands = plan.iterate.touches and _stands(plan)
+        self._steps_standing = self._steps_standing + 1 if stands else 0
         self._counts[plan.status] += 1
         old = plan.status in (Status.PREVIOUS, Status.BRAKING)
         self.replayed = self.replayed + 1 if old else 0
@@ -287,3 +304,13 @@ class MPC:
     def _shifted(self) -> Iterate:
         assert self._last is not None
         return self._last.shifted(self.problem.model)
+
+
+def _stands(plan: Plan) -> bool:
+    """Whether a plan hardly moves, and not because it is where it is to be."""
+    model = plan.step.problem.model
+    away, wanted = (
+        float(np.abs(x[1:, model.position] - plan.X[0, model.position]).max())
+        for x in (plan.X, plan.step.x_ref)
+    )
+    return away < AT_REST * model.dt * len(plan.U) < wanted

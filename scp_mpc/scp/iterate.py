@@ -165,7 +165,7 @@ def as_iterate(guess: Trajectory | Iterate, problem: Problem) -> Iterate:
         shapes = {"dynamics": (N, model.nx), "inputs": (N, model.nu), "margin": (M,)}
         _check(guess.multipliers, {**shapes, "obstacles": (M, nodes), "slack": (M, nodes)})
         if guess.multipliers.states.size:
-            _check(guess.multipliers, {"states": (N, len(problem.bounded_states))})
+            _check(guess.multipliers, {"states": (N, len(problem.state_rows))})
         if guess.multipliers.rates.size:
             _check(guess.multipliers, {"rates": (N, model.nu)})
     return replace(guess, alternatives={})  # what a caller cannot see does not count

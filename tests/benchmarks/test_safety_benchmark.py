@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.safety import broken, episode, judged, main, summarise
-from benchmarks.safety_drive import Drive, drive
+from benchmarks.safety_drive import Drive, Way, drive
 from benchmarks.safety_search import is_reachable
 from benchmarks.safety_worlds import ROBOTS, SHARES, Thing, World
 from scp_mpc import MPC, SCP, Settings, Status
@@ -157,6 +157,19 @@ def test_a_rescue_repairs_many():
     start = np.array([0.01, 0.0, 0.0, 0.0])
     guess = solver.brake(start, w.x_ref).iterate
     assert solver.solve(start, w.x_ref, told, guess).status is Status.CONVERGED
+
+
+@pytest.mark.slow
+def test_who_stands_too_long_plans_afresh():
+    """Nose to a disc, with a way to the side: from standing the search ends in standing."""
+    w = World(67)
+    w.start = np.array([0.49, 0.09, 0.22, 0.0, 0.0])
+    mpc, told = MPC(w.problem, Settings(deadline=None)), w.predictions(0.0)
+    mpc.step(w.start, w.start, told)
+    x_ref = Way(w).states(w.start, 0)
+    away = [np.linalg.norm(mpc.step(w.start, x_ref, told).X[-1] - w.start) for _ in range(11)]
+    assert max(away[:-1]) < 0.3
+    assert away[-1] > 0.8
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from instances import problem, straight_reference
 
-from scp_mpc import MPC, DoubleIntegrator, Iterate, ShapeError, Trajectory
+from scp_mpc import MPC, SCP, DoubleIntegrator, Iterate, ShapeError, Trajectory
 from scp_mpc.scp import Multipliers
 from scp_mpc.trajectory import rollout
 
@@ -54,6 +54,15 @@ def test_the_shifted_rest_of_a_plan_obeys_the_dynamics():
         expected = model.step(nominal.states[i], nominal.inputs[i])
         np.testing.assert_allclose(nominal.states[i + 1], expected, atol=1e-9)
     np.testing.assert_array_equal(nominal.states[0], plan.X[1])
+
+
+def test_a_plan_with_a_bounded_speed_is_a_guess():
+    bounded = problem(N, speed_max=1.0)
+    ref = straight_reference(N)
+    first = SCP(bounded).solve(0 * ref[0], ref)
+    again = SCP(bounded).solve(0 * ref[0], ref, guess=first.iterate)
+    np.testing.assert_allclose(again.X, first.X, atol=1e-6)
+    assert again.iterations <= first.iterations
 
 
 def test_rollout_applies_the_inputs():
