@@ -16,7 +16,7 @@ inputs change by, and the merit is cost and penalty on all violations.
 """
 
 from dataclasses import replace
-from math import inf
+from math import inf, isnan
 
 import numpy as np
 
@@ -118,6 +118,10 @@ class Loop:
                 return None
         if reached is None:
             return None
+        if reached.residuals.worst <= self._settings.tolerance and isnan(
+            reached.residuals.curvature
+        ):
+            reached, _ = at.second_order(reached, program, solution)
         if self._is_nearly_feasible(reached):  # out of iterations: a plan that can be followed
             near = restored(at, reached, self._settings.tolerance)
             reached, level = (near, Relaxation.NONE) if near is not None else (reached, level)

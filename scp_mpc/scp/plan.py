@@ -211,6 +211,6 @@ def judge(residuals: KKTResiduals, slack: float, tolerance: float) -> Status:
     """Return the status of a plan with the given residuals and largest slack."""
     outside = not (residuals.feasibility <= tolerance and slack <= tolerance)  # or NaN
     certified = residuals.worst <= tolerance and slack == slack
-    if certified and not residuals.curvature < -CURVATURE_TOLERANCE:
+    if certified and residuals.curvature >= -CURVATURE_TOLERANCE:  # and not NaN, unknown
         return Status.SOFTENED if outside else Status.CONVERGED
     return Status.VIOLATING if outside else Status.FEASIBLE

@@ -192,7 +192,7 @@ class Transcription:
         lower, upper = self.relaxed_bounds(Relaxation.NONE)
         if (lower[box] <= free[box]).all() and (upper[box] >= free[box]).all():
             self.hard.solver.finished["kkt"] += 1
-            return self.plain(free[self.layout.u].reshape(rest.shape))
+            return _convex(self.plain(free[self.layout.u].reshape(rest.shape)))
         planes = self.no_pairs.planes(free)
         qp = self.condensed_qp(condensed, self.no_pairs, planes)
         active = np.zeros(len(qp.F), dtype=np.intp)
@@ -206,7 +206,9 @@ class Transcription:
             return None
         self.hard.solver.finished["kkt"] += 1
         given = condensed, self.no_pairs, planes, Relaxation.NONE, qp, self.hard
-        return self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
+        return _convex(
+            self.certify(Program(*given, Rows(np.zeros(0, dtype=np.intp))), end.solution)
+        )
 
     def outputs(self, iterate: Iterate) -> FloatArray:
         """Y (ny,) of an iterate's own states, which need not be where its inputs lead."""
@@ -418,8 +420,7 @@ class Transcription:
         W = self._dynamics_curvature(program, solution)
         factors = self.curvature_factors(program, solution.force[nf:])[0]
         if W is None and not len(factors):  # nothing but the convex program
-            residuals = replace(plan.residuals, curvature=1.0)
-            return replace(plan, residuals=residuals), np.zeros(self.layout.shape)
+            return _convex(plan), np.zeros(self.layout.shape)
         depth, side = qp.violations(solution.v)
         touched = (depth >= -_TOUCH) & (solution.active == 0)  # without a force: weakly active
         indices = np.concatenate([solution.indices, touched.nonzero()[0]])
@@ -481,3 +482,8 @@ class Transcription:
         whole = np.zeros((self.layout.variables,) * 2)
         whole[:n, :n] = back.T @ W @ back
         return whole
+
+
+def _convex(plan: Nominal) -> Nominal:
+    """A plan of a convex problem, whose least curvature is that of its cost."""
+    return replace(plan, residuals=replace(plan.residuals, curvature=1.0))
