@@ -37,7 +37,7 @@ def moving(rng, dim=2):
         rng.normal(size=dim) + np.arange(N + 1)[:, None] * 0.2 * rng.normal(size=dim),
         G @ np.swapaxes(G, 1, 2),
         rng.uniform(0.0, 0.4),
-        shape=Polytope(corners),
+        shape=Polytope(corners - corners.mean(axis=0)),
     )
 
 
