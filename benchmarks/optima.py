@@ -217,11 +217,12 @@ def judged(
         best = min(best, found.cost) if found.ok else best
     residuals = referee.kkt(plan) if plan.status.name == "CONVERGED" and not bounds else {}
     scale = max(1.0, plan.cost)
-    gap = plan.cost / best - 1 if best < np.inf else -np.inf
+    solvable = best < np.inf
+    gap = plan.cost / best - 1 if solvable else 0.0
     return {
         "status": plan.status.name,
         "cost": plan.cost,
-        "best": best,
+        "best": best if solvable else None,  # nothing meets all constraints, as far as IPOPT knows
         "gap": gap,
         "residual": max(residuals.values(), default=0.0) / scale,
         "ms": 1e3 * seconds,
@@ -278,11 +279,13 @@ def summarise_plans(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Gaps by case."""
     total = []
     for case in sorted({row["case"] for row in rows}):
-        some = [row for row in rows if row["case"] == case]
+        every = [row for row in rows if row["case"] == case]
+        some = [row for row in every if row["best"] is not None]
         total.append(
             {
                 "case": case,
                 "episodes": len(some),
+                "unsolvable": len(every) - len(some),
                 "good": sum(row["good"] for row in some),
                 "far": sum(row["gap"] > _FAR for row in some),
                 "converged": sum(row["status"] == "CONVERGED" for row in some),
@@ -311,13 +314,13 @@ def markdown(total: Sequence[dict[str, Any]]) -> str:
         ]
         return table(names, "lrrrrr", arrivals)
     names = (
-        "Case | Plans | CONVERGED | Within 1 % of IPOPT's best | More than 25 % above "
+        "Case | Plans, none exists | CONVERGED | Within 1 % of IPOPT's best | More than 25 % above "
         "| Largest gap | Largest residual by CasADi | Median [ms]"
     )
     cells = [
         (
             row["case"],
-            row["episodes"],
+            f"{row['episodes']}, {row['unsolvable']}",
             row["converged"],
             f"{row['good']} ({100 * row['good'] / row['episodes']:.1f} %)",
             row["far"],

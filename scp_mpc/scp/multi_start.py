@@ -150,10 +150,12 @@ class MultiStart:
         # A plan with slack is beaten by any without, and one that costs far more by others: then
         # more candidates are worth their time.
         for k, one in enumerate(ranked):
-            little = safe and one.merit > _PROMISING * goal.merit
-            if one.v is None or (little and (one.waits or k >= follow)):
+            wanted = k < follow if safe else k < _MOST_FOLLOWED and not goal.status.ok
+            if one.waits or (safe and not wanted and k < _MOST_FOLLOWED):
+                wanted = one.merit <= _PROMISING * goal.merit
+            if one.v is None or not wanted:
                 continue
-            if (not safe and goal.status.ok) or not clock.allows("iteration"):
+            if not clock.allows("iteration"):
                 break
             if safe and same_pattern(step, about.passing(one), here):
                 continue  # this candidate leads to where we are
