@@ -31,8 +31,8 @@ risk: $(VENV)/.dev  ## promised against measured risk, by Monte Carlo
 	$(BIN)/python benchmarks/risk.py --out $(OUT)
 
 safety: $(VENV)/.dev  ## random worlds: who is safe and who arrives; stop it and go on as you like
-	$(BIN)/python benchmarks/safety.py --kind standing --out $(OUT)/safety
-	$(BIN)/python benchmarks/safety.py --kind moving --out $(OUT)/safety
+	$(BIN)/python benchmarks/safety.py --kind standing --out $(OUT)
+	$(BIN)/python benchmarks/safety.py --kind moving --out $(OUT)
 
 soak: $(VENV)/.dev  ## a million control steps with faults; stop it and go on as you like
 	$(BIN)/python benchmarks/soak.py --out $(OUT)
