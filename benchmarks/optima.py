@@ -51,13 +51,13 @@ def main(
 
     Args:
         kind: One of `KINDS`.
-        out: Folder for optima-kind.jsonl, .md and .json.
+        out: Folder for optima_kind.jsonl, .md and .json.
         episodes: How many; their seeds are 0, 1, ...
         starts: IPOPT's, of each instance.
         jobs: Processes.
         echo: Takes the Markdown table.
     """
-    name = f"optima-{kind}"
+    name = f"optima_{kind}"
     count = KINDS[kind] if episodes is None else episodes
     rows = in_one_thread(_rows, kind, count, starts, out / f"{name}.jsonl", jobs)
     total = summarise_goals(rows) if kind == "goals" else summarise_plans(rows)
