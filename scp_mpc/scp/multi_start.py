@@ -35,7 +35,8 @@ from scp_mpc.scp.transcription import Relaxation, Transcription
 
 # It must be better by this share, or the plan flickers between candidates of equal cost.
 _HYSTERESIS = 0.001
-_MOST_FOLLOWED = 8  # candidates, where the plan needs slack or others promise much
+_MOST_FOLLOWED = 8  # candidates, where the plan needs slack
+_MOST_PROMISING = 3  # candidates, where others promise to cost much less
 _PROMISING = 0.5  # share of the plan's merit that is much less
 _CUTOFF = 3.0  # times the plan's own merit: more than that one program does not make good
 _BEAM = 3  # candidates among polytopes that are varied
@@ -151,7 +152,7 @@ class MultiStart:
         # more candidates are worth their time.
         for k, one in enumerate(ranked):
             wanted = k < follow if safe else k < _MOST_FOLLOWED and not goal.status.ok
-            if one.waits or (safe and not wanted and k < _MOST_FOLLOWED):
+            if one.waits or (safe and not wanted and k < _MOST_PROMISING):
                 wanted = one.merit <= _PROMISING * goal.merit
             if one.v is None or not wanted:
                 continue
