@@ -26,7 +26,8 @@ SECONDS, NEAR, STAY = 20.0, 0.3, 1.0  # a drive ends after so long, or so near t
 _SEEK = 1.0  # [s] after which the path is sought again
 _STANDING = 0.3, 0.0  # [m/s] up to which a thing is in the way; the last where there is no way else
 _SPEED = 2.0  # [m/s] along a path of who knows no limit
-_ACCELERATION = 1.0  # [m/s^2] along a path
+_ACROSS, _ALONG = (1.0, None), 1.0  # [m/s^2] at a path's corners, and along it
+_HELD_UP, _PATIENCE = 0.1, 2.5  # [m] or less in a second, [s] before it takes them otherwise
 
 
 class Controller(Protocol):
@@ -83,7 +84,8 @@ class Drive:
 class Way:
     """What to track: the shortest path around what stands, or the goal itself where there is none.
 
-    It is sought again every second.
+    It is sought again every second. The reference takes its corners slowly, so that the robot goes
+    round them, too; where that holds it up, quickly, then slowly again, and so on.
 
     Args:
         world: Where.
@@ -91,8 +93,7 @@ class Way:
 
     def __init__(self, world: World) -> None:
         """Nothing is known yet."""
-        self._world = world
-        self._limits = SpeedLimits(world.speed_max or _SPEED, longitudinal=_ACCELERATION)
+        self._world, self._turn, self._since, self._last = world, 0, 0.0, np.full(2, np.inf)
         self._follow: PathReference | None = None
 
     def states(self, x: FloatArray, k: int) -> FloatArray:
@@ -102,13 +103,19 @@ class Way:
         return self._world.x_ref if self._follow is None else self._follow.states(x)
 
     def _seek(self, start: FloatArray, time: float) -> None:
-        problem, goal, told = self._world.problem, self._world.goal, self._world.predictions(time)
-        self._follow = None
+        world, problem, told = self._world, self._world.problem, self._world.predictions(time)
+        if time >= self._since + _PATIENCE and np.linalg.norm(start - self._last) < _HELD_UP:
+            self._turn, self._since = self._turn + 1, time
+        self._last, self._follow = start, None
         for speed in _STANDING:
-            path = shortest_path(problem, start, goal, told, tolerance=0.9 * NEAR, standing=speed)
+            path = shortest_path(
+                problem, start, world.goal, told, tolerance=0.9 * NEAR, standing=speed
+            )
             if path is not None:
+                across = _ACROSS[self._turn % len(_ACROSS)]
+                limits = SpeedLimits(world.speed_max or _SPEED, across, _ALONG)
                 self._follow = PathReference(
-                    path, speed=self._limits, model=problem.model, horizon=problem.horizon
+                    path, speed=limits, model=problem.model, horizon=problem.horizon
                 )
                 break
 
