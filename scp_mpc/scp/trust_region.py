@@ -21,7 +21,7 @@ _SHRINK, _GROW = 0.3, 3.0
 _SMALLEST = 1e-8  # relative to the inputs' range, at which to give up
 _CLOSE = 1e-2  # KKT residual from which on its fall counts, whatever the merit does
 _NOISE = 1e-12  # of the merit, relative
-_SUSPICIOUS = 10  # refused steps in a row; with right derivatives few, near poles up to seven
+_SUSPICIOUS = 14  # refused steps in a row; with right derivatives hardly ever more than ten
 
 _log = logging.getLogger(__name__)
 
