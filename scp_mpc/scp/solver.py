@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 _CORRECTIONS = 4  # of what was assumed about the motion between nodes
 _WARM_UP = 3  # steps
-_MANOEUVRES = 2  # that are followed
+_MANOEUVRES = 4  # that are followed
 _BETTER = 1e-3  # share of the merit by which one has to win
 _SPARE = 10  # iterations for which there has to be time
 
