@@ -226,7 +226,7 @@ def judged(
         "gap": gap,
         "residual": max(residuals.values(), default=0.0) / scale,
         "ms": 1e3 * seconds,
-        "good": gap <= _WITHIN,
+        "good": plan.ok and gap <= _WITHIN,
     }
 
 

@@ -25,7 +25,7 @@ from scp_mpc.deadline import Clock, Timer
 from scp_mpc.errors import ConcurrentUseError, TooManyObstaclesError
 from scp_mpc.obstacles.prediction import ObstaclePrediction, require_fitting
 from scp_mpc.problem import ROUNDING, Problem
-from scp_mpc.scp.braking import AT_REST
+from scp_mpc.scp.braking import stands
 from scp_mpc.scp.iterate import Iterate
 from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
@@ -270,7 +270,10 @@ class MPC:
         After so many steps of standing, and after twice as many each time.
         """
         times, rest = divmod(self._steps_standing, _AFRESH)
-        return times > 0 and not rest and times & (times - 1) == 0 and _stands(plan)
+        return times > 0 and not rest and times & (times - 1) == 0 and self._stands(plan)
+
+    def _stands(self, plan: Plan) -> bool:
+        return stands(self.problem, plan.X, plan.step.x_ref)
 
     def _within(self, plan: Plan, last: FloatArray | None) -> bool:
         lower, upper = self.problem.u_min, self.problem.u_max
@@ -293,8 +296,8 @@ class MPC:
         self._last, self._applied = start, plan.u0
         self._obstacles = recall.obstacles
         self._steps_touching = self._steps_touching + 1 if plan.iterate.touches else 0
-        stands = plan.iterate.touches and _stands(plan)
-        self._steps_standing = self._steps_standing + 1 if stands else 0
+        standing = plan.iterate.touches and self._stands(plan)
+        self._steps_standing = self._steps_standing + 1 if standing else 0
         self._counts[plan.status] += 1
         old = plan.status in (Status.PREVIOUS, Status.BRAKING)
         self.replayed = self.replayed + 1 if old else 0
@@ -304,13 +307,3 @@ class MPC:
     def _shifted(self) -> Iterate:
         assert self._last is not None
         return self._last.shifted(self.problem.model)
-
-
-def _stands(plan: Plan) -> bool:
-    """Whether a plan hardly moves, and not because it is where it is to be."""
-    model = plan.step.problem.model
-    away, wanted = (
-        float(np.abs(x[1:, model.position] - plan.X[0, model.position]).max())
-        for x in (plan.X, plan.step.x_ref)
-    )
-    return away < AT_REST * model.dt * len(plan.U) < wanted

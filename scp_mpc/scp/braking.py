@@ -40,6 +40,13 @@ def resting_input(problem: Problem) -> FloatArray:
     return np.clip(problem.model.equilibrium_input, problem.u_min, problem.u_max)
 
 
+def stands(problem: Problem, states: FloatArray, x_ref: FloatArray) -> bool:
+    """Whether a plan (N+1, nx) hardly moves, and not because it is where its reference is."""
+    at = problem.model.position
+    away, wanted = (float(np.abs(x[1:, at] - states[0, at]).max()) for x in (states, x_ref))
+    return away < AT_REST * problem.model.dt * problem.horizon < wanted
+
+
 def _stop(problem: Problem, x: FloatArray, rest: FloatArray) -> FloatArray | None:
     """The input (nu,) that stops the robot, as far as the bounds allow; None at rest."""
     wanted = problem.model.stopping_input(x) - rest

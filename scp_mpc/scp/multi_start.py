@@ -189,7 +189,7 @@ class MultiStart:
         paths: list[FloatArray],
         known: list[Duals | None],
         thorough: bool,
-        waits: Sequence[bool] = (),
+        waits: Sequence[bool],
     ) -> list[Ranked | None]:
         """Look at one program about each path (C, d), all linearised at once, until the deadline.
 
@@ -214,15 +214,14 @@ class MultiStart:
             bound, qp, planes, force = programs[k]
             if not at.clock.allows("candidate"):
                 break
-            waiting = any(waits[k : k + 1])
-            most = _PROMISING * best.merit if waiting and best.status.ok else limit
+            most = _PROMISING * best.merit if waits[k] and best.status.ok else limit
             if force is not None and bound > most:
                 at.hard.solver.finished["cut"] += 1
                 looks[k] = Ranked(inf, planes, force)
                 continue
             one = self._look(about, planes, relaxation, qp, most, thorough)
-            looks[k] = replace(one, waits=waiting)
-            if only_best and not waiting:
+            looks[k] = replace(one, waits=waits[k])
+            if only_best and not waits[k]:
                 limit = min(limit, one.merit)
         return looks
 
@@ -277,7 +276,9 @@ class MultiStart:
             if not paths or not most:
                 break
             began = clock.mark()
-            looks = self._rank(best, about, paths[:most], [None] * len(paths[:most]), True)
+            paths = paths[:most]
+            unknown: list[Duals | None] = [None] * len(paths)
+            looks = self._rank(best, about, paths, unknown, True, [False] * len(paths))
             more = [one for one in looks if one is not None]
             clock.learn("candidate", began, len(more))
             beam = _best([*beam, *more])

@@ -31,7 +31,7 @@ from scp_mpc.geometry.margin import JointRisk
 from scp_mpc.obstacles.prediction import ObstaclePrediction
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import QuadraticProgram
-from scp_mpc.scp.braking import AT_REST
+from scp_mpc.scp.braking import stands
 from scp_mpc.scp.certificate import Nominal
 from scp_mpc.scp.fallback import Fallback
 from scp_mpc.scp.iterate import Iterate, as_iterate
@@ -336,7 +336,7 @@ class SCP:
             if last is None or not last.touches or at.clock.room("iteration", 2) == 2:
                 found = self._loop.run(start, limit=limit)
             found = found or self._loop.result(start)
-            if last is not None and self._stands(found):
+            if last is not None and stands(self.problem, found.iterate.states, at.step.x_ref):
                 others = [at.plain(inputs) for inputs in self._starts()]
             for other in others:
                 if at.clock.room("iteration", _SPARE) < _SPARE:
@@ -355,14 +355,6 @@ class SCP:
             with clock.task("manoeuvres"):
                 starts.extend(manoeuvres(at.step, _MANOEUVRES))
         return starts
-
-    def _stands(self, plan: Result) -> bool:
-        """Whether a plan hardly moves, and not because it is where it is to be."""
-        step, model, states = self._at.step, self.problem.model, plan.iterate.states
-        away, wanted = (
-            float(np.abs(x[1:, model.position] - step.here).max()) for x in (states, step.x_ref)
-        )
-        return away < AT_REST * model.dt * self.problem.horizon < wanted
 
     def _rescued(self, step: Step, last: Iterate | None, best: Result, brake_first: bool) -> Result:
         """Without a plan that meets every constraint: go on from one that does, if known.
