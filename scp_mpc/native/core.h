@@ -445,7 +445,7 @@ int refine(scp_core *core, const program *p, const solution *convex, solution *t
 /* ---- start.c: manoeuvres.py; multi_start.c, candidates.c */
 
 int manoeuvres(scp_core *core, int most, double *U); /* how many; U (most, N, nu) */
-void lay_out_candidates(scp_core *core, arena *from);
+size_t scratch_of_candidates(const scp_core *core);
 typedef struct {
     int obstacle, waits;
     double side[3], time;
