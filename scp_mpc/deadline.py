@@ -13,6 +13,7 @@ _HICCUP = 3.0  # times what is known of a task, or its processor time: something
 _LEAST = 1e-6  # [s] of any task
 _PATIENCE = 3  # times that a task is not begun before it is tried again, whatever is known
 _MOST_PATIENCE = 200
+_RESERVE = 0.1  # of the deadline, for what takes longer than ever before
 _COUNTED = ("iteration", "candidate")  # tasks that solve a program
 
 Timer = Callable[[], float]
@@ -89,7 +90,8 @@ class Clock:
     """The time of one control step, its deadline and its budget of programs.
 
     Args:
-        deadline: Seconds after which the step is late; None for never.
+        deadline: Seconds after which the step is late, a tenth of which is kept free; None for
+            never.
         pace: Times of earlier steps.
         programs: How many programs the step may solve or rank.
         timer: Tells the time [s]; None for the machine's clock.
@@ -106,7 +108,7 @@ class Clock:
         timer: Timer | None = None,
     ) -> None:
         """Begin the step."""
-        self._deadline = inf if deadline is None else deadline
+        self._deadline = inf if deadline is None else (1 - _RESERVE) * deadline
         self._pace, self._programs = Pace() if pace is None else pace, programs
         self._now, self._worked = (perf_counter, thread_time) if timer is None else (timer, timer)
         self.spent: defaultdict[str, float] = defaultdict(float)

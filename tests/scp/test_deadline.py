@@ -42,6 +42,16 @@ def test_nothing_begins_that_would_end_late(time):
     assert Clock(None, pace).room("task", 9) == 9
 
 
+def test_a_tenth_of_the_deadline_is_kept_free(time):
+    pace = Pace()
+    pace.learn("task", 0.05)
+    clock = Clock(1.0, pace)
+    time[0] = 0.84
+    assert clock.allows("task")
+    time[0] = 0.86
+    assert not clock.allows("task")
+
+
 def test_a_single_hiccup_is_not_the_tasks():
     """Seconds in which its thread did not work count from the second time in a row on."""
     pace = Pace()

@@ -1,5 +1,7 @@
 """Replay: the robot's way through a recorded crowd, and who it touched."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from recordings import street
@@ -34,8 +36,9 @@ def test_the_robot_crosses_and_touches_nobody(run):
     assert not any(meeting.touched for meeting in meetings)
     assert find_contacts(run) == []
     assert meetings[0].clearance == run.clearances.min() > 0
-    statuses = {plan.status for plan in run.plans}
-    assert statuses <= {Status.CONVERGED, Status.FEASIBLE, Status.SOFTENED}
+    statuses = Counter(plan.status for plan in run.plans)
+    assert set(statuses) <= {Status.CONVERGED, Status.FEASIBLE, Status.STOPPING}
+    assert statuses[Status.STOPPING] <= 0.05 * run.steps  # somebody came nearer than the room
     assert 6 < time_alone(run) < 12
     assert (np.abs(run.inputs) <= 3 + 1e-9).all()
 
@@ -113,7 +116,7 @@ def test_a_robot_with_a_nose():
         Unicycle(0.2), horizon=12, Q=[1, 1, 0.02, 0.1], R=[0.05, 0.05], u_min=-2, u_max=2,
         robot_radius=0.3, max_obstacles=4,
     )  # fmt: skip
-    run = replay(street(people=4, frames=30, seed=2), Crossing([0, -3], [0, 3]), problem)
+    run = replay(street(people=4, frames=40, seed=2), Crossing([0, -3], [0, 3]), problem)
     assert np.allclose(run.states[0], [0, -3, np.pi / 2, 0])
     assert len(arrivals(run)) >= 2
     assert run.clearances.min() > 0

@@ -32,7 +32,7 @@ def test_a_walk_is_predicted():
         follower.update(0.4 * k, [[0.48 * k, 1.0]], ["ann"])
     (ann,) = follower.predictions()
     assert isinstance(ann, ObstaclePrediction)
-    assert (ann.name, ann.radius, ann.horizon) == ("ann", 0.3, 10)
+    assert (ann.name, ann.radius, ann.horizon) == ("ann", 0.3 + TrackerSettings().room, 10)
     assert ann.stamp == pytest.approx(7.6)
     walk = np.stack([9.12 + 1.2 * 0.2 * np.arange(11), np.ones(11)], axis=1)
     assert np.abs(ann.means - walk).max() < 0.02
@@ -335,6 +335,7 @@ def test_bad_trackers_are_refused(changes, error):
         ({"speed": -1.0}, BoundsError),
         ({"confirmations": 0}, BoundsError),
         ({"keep": -1.0}, BoundsError),
+        ({"room": -0.1}, BoundsError),
         ({"keep_new": -1.0}, BoundsError),
         ({"silence": 0.0}, BoundsError),
         ({"gate": 1.0}, BoundsError),
