@@ -54,9 +54,13 @@ class Body:
         return self.position
 
     def predicted(self, time: float, dt: float, horizon: int) -> ObstaclePrediction:
-        """The true future from a time on."""
+        """The true future from a time on; who leaves meanwhile is told to go on as it went."""
         if callable(self.position):
             means = np.array([self.at(time + i * dt) for i in range(horizon + 1)])
+            gone = np.isnan(means).any(axis=1)
+            if gone.any() and (k := int(gone.argmax())):
+                way = means[k - 1] - means[max(k - 2, 0)]
+                means[k:] = means[k - 1] + np.arange(1, horizon + 2 - k)[:, None] * way
         else:
             means = np.tile(self.position, (horizon + 1, 1))
         Sigma = self.covariances

@@ -168,6 +168,13 @@ def test_a_contact_at_the_end_of_the_last_interval_counts(steps):
     assert (contact.kind, contact.body_closing) == ("at rest", pytest.approx(1.0))
 
 
+def test_who_leaves_within_the_horizon_is_told_to_go_on():
+    leaver = Body(lambda t: [2.0 - t, 1.0] if t < 0.75 else [np.nan, np.nan], 0.3)
+    told = leaver.predicted(0.2, 0.1, 10)
+    assert np.allclose(told.means[:, 0], 1.8 - 0.1 * np.arange(11))
+    assert np.allclose(leaver.predicted(0.7, 0.1, 3).means, [1.3, 1.0])  # nothing is known of it
+
+
 def test_bodies_check_themselves():
     with pytest.raises(BoundsError, match="radius"):
         Body([0.0, 0.0], -0.1)
