@@ -192,12 +192,14 @@ typedef enum { QP_SOLVED, QP_INFEASIBLE, QP_UNSOLVED, QP_CUT } qp_end;
 
 /* ---- condensing: condensing.py */
 
-/* How outputs answer to v along some derivatives. */
+/* How outputs answer to v along some derivatives. A Riccati pass gives the coordinates,
+ *     v_i = L_i'(du_i + K_i de_i),     H = sum of the L_i L_i' around,
+ * so that v_i acts on interval i and later ones only: rows of S are zero beyond their interval. Any
+ * rotation of v would do; Python's is another. u = u_free + (rows u of S) v; sizes come last in v. */
 typedef struct {
-    double *G;        /* (N, nx, n) responses of e to the inputs */
-    double *weighed;  /* (N nx, n) 2 Q G */
-    double *L;        /* (n, n) lower Cholesky factor of the Hessian */
-    double *inverse;  /* (n, n) L^-1, lower */
+    double *K;        /* (N, nu, nx) feedback of the plan that nothing constrains */
+    double *L;        /* (N, nu, nu) lower Cholesky factors of 2 R + B'P B */
+    double *E;        /* (N, nx, n) responses of e to v */
     double *S;        /* (ny, nv) */
 } sensitivity;
 
@@ -276,6 +278,8 @@ struct scp_core {
     derivatives always;
     sensitivity always_by;
     double *drift;             /* (N, nx) condensing.py's _drift */
+    int *reach;                /* (ny,) inputs that come before an output: a row of S is zero from
+                                * there to n, where the sizes begin */
 
     void *models, *geometry, *condensing, *active, *certify, *loop, *newton, *start, *candidates,
         *fallback, *backup, *solver, *memory; /* what the parts keep for themselves */
@@ -385,6 +389,11 @@ void outputs_of(const scp_core *core, const double *p, const double *s, const do
                 const double *e, double *y); /* layout.outputs */
 void y_of(const scp_core *core, const condensed *c, const double *v, double *y);
 void deviations_of(const scp_core *core, const condensed *c, const double *v, double *e);
+/* Second derivatives (nv, nv) in v of stages (N, nx+nu, nx+nu), and sway (N,) in headings or NULL:
+ * Transcription._condensed_curvature, symmetric, whole */
+void curvature_in_v(scp_core *core, const sensitivity *by, const double *stages, const double *sway,
+                    double *W);
+size_t scratch_of_condensing(const scp_core *core);
 void derivatives_roll(const scp_core *core, const derivatives *D, double *e);     /* D e = pushed, in place */
 void derivatives_costates(const scp_core *core, const derivatives *D, double *nu); /* D'nu = forces, in place */
 
