@@ -135,7 +135,8 @@ typedef struct {
     const double *means;           /* (J, C+1, d) at nodes, row 0 now */
     const double *covariances;     /* (J, C+1, d, d) grown, with the robot's, scaled */
     const double *largest_std;     /* (J, C+1) bounds of deviations in any direction */
-    const double *drift;           /* (J, C) way of the obstacles between two instants */
+    const double *drift;           /* (J, C) way of the obstacles between two instants; NULL if K = 1 */
+    const double *bare, *bare_std; /* covariances and largest_std before sizes scaled them */
     double *radii;                 /* (J, C), widened or plain */
     double *rotation, *deviation;  /* (J, C, d, d) and (J, C, d): eigenvectors in columns, ascending */
     uint8_t *decomposed;           /* (J, C) which of these are there: see no_go_of */
@@ -143,12 +144,29 @@ typedef struct {
     int has_shapes;                /* whether any is one */
 } step;
 
+/* Predictions of J obstacles, row 0 now. */
+typedef struct {
+    int J;
+    const double *means, *covariances, *largest_std; /* (J, N+1, ...) */
+    const double *radii;                             /* (J,) */
+    const int *shape;                                /* (J,) */
+} predictions;
+
+/* Memory for the arrays of a step. */
+typedef struct {
+    nodes nodes;
+    double *means, *covariances, *scaled, *largest_std, *scaled_std, *drift, *radii;
+    double *rotation, *deviation;
+    uint8_t *decomposed;
+} step_room;
+
 /* ---- polytopes of a step; polytopes.py */
 
 typedef struct {
     int corners, faces, ridges;
     const double *corner, *normal, *offset; /* (corners, d), (faces, d), (faces,) */
     const double *begin, *along;            /* (ridges, d): corners in the plane, edges in space */
+    double size;                            /* how far its corners are from the origin */
 } solid;
 
 /* One no-go set: the s-sigma ellipsoid and the radii, or a polytope. */
@@ -270,8 +288,8 @@ struct scp_core {
     double *lower, *upper;     /* (ny,) bounds of y */
     double *strict_lower, *strict_upper; /* those outside their bounds now as far as braking goes */
     double *braked_lower, *braked_upper; /* all hard ones so */
-    double *braking_u, *braking_x; /* (N, nu), (N+1, nx) braking from now on */
-    int braking_steps;
+    double *braking_u, *braking_x; /* (N, nu), (N+1, nx) braking from now on; see brake_now */
+    int braking_steps;             /* -1: not computed yet */
     double *row_price;         /* (N nb,) price of a state's excess in merits */
 
     /* of a linear robot: always the same */
@@ -282,7 +300,7 @@ struct scp_core {
                                 * there to n, where the sizes begin */
 
     void *models, *geometry, *condensing, *active, *certify, *loop, *newton, *start, *candidates,
-        *fallback, *backup, *solver, *memory; /* what the parts keep for themselves */
+        *fallback, *backup, *solver, *memory, *steps; /* what the parts keep for themselves */
 };
 
 /* ---- linear algebra: linalg.c. Matrices row by row; lda = columns unless said. */
@@ -348,27 +366,44 @@ void no_go_curvature(const scp_core *core, const no_go *set, double s, double g,
 double signed_distance(int d, const double *y, const double *semi_axes, const double *side, double *n);
 double solid_distance(int d, const solid *body, const double *y, const double *side, double *n,
                       double *bend); /* n, bend may be NULL */
+void solid_over(int d, const solid *body, int face, const double *y, double *to);
+void tangents(int d, const double *n, double *T); /* T (d, d-1) completes a unit vector to a basis */
 double risk_of(const scp_core *core, const no_go *set, const double *position); /* risk_bound */
 double size_at_risk(double risk);
 
-/* ---- step.c; step.py, layout.py's bounds, braking.py */
+/* ---- step.c; step.py, layout.py's bounds */
 
 void lay_out_step(scp_core *core, arena *from);
-int read_step(scp_core *core);  /* checks core->in; 0, or the number of the input that is wrong */
+void set_up_step(scp_core *core);
+size_t scratch_of_step(const scp_core *core);
+/* Checks core->in; 0, or the number of the input that is wrong. Then core->now is `plain`; `wide` has
+ * radii of its own, which are not filled yet; bounds that are the same are one array. */
+int read_step(scp_core *core);
+void lay_out_room(const scp_core *core, arena *from, nodes of, step_room *room);
+void predict(const scp_core *core, const predictions *given, const double *robot_covariance,
+             double scale, step_room *room, step *to); /* all of a step but x0, x_ref and u_last */
 /* node i counts from 0 = now: `path` is (C+1, d) */
 int within(const scp_core *core, const step *at, const double *path, const double *s,
            double distance, const uint8_t *known, uint8_t *near); /* how many; near (J, C) */
-void depths(const scp_core *core, const step *at, const double *path, const double *s,
+void depths(scp_core *core, const step *at, const double *path, const double *s,
             double *deep); /* (J, C); path (C, d) of nodes 1 .. C; s (M,) */
 void path_of(const scp_core *core, const double *y, double *path); /* (C+1, d), absolute */
+/* Step.scaled with sizes (J, C), Step.risks (J, C) of a path (C, d); there is one scaled step */
+void scale_step(scp_core *core, const step *from, const double *sizes, step *to);
+void step_risks(const scp_core *core, const step *at, const double *path, double *risks);
+
+/* ---- braking.c; braking.py, problem.py */
+
 int braking(const scp_core *core, int N, const double *x, const double *u_last, double *U,
             double *X); /* steps; U (N, nu), X (N+1, nx) */
+void brake_now(scp_core *core); /* core->braking_*, once a step */
 void resting_input(const scp_core *core, double *u);
-void limited(const scp_core *core, int N, double *U, const double *u_last); /* problem.py's, in place */
-int stands(const scp_core *core, const double *X);  /* braking.py's stands() */
+void reach(const scp_core *core, const double *u_last, double *lower, double *upper);
+void limited(const scp_core *core, int N, double *U, const double *u_last); /* in place */
+int stands(const scp_core *core, const double *X);
 double row_excess(const scp_core *core, int N, const double *X, int hard_only); /* most, states 1 .. N */
 double plan_cost(const scp_core *core, const double *X, const double *U, const double *s);
-void scale_step(const scp_core *core, const step *from, const double *sizes, step *to); /* Step.scaled; sizes (J, C) */
+double plan_penalty(const scp_core *core, const double *slack, const double *X); /* slack (M, C) */
 
 /* ---- condensing.c */
 
@@ -474,12 +509,17 @@ void multi_start(scp_core *core, result *best, const double *free_path, int has_
 void lay_out_fallback(scp_core *core, arena *from);
 void fall_back(scp_core *core, const step *at, const scp_iterate *last, const result *found,
                int brake_first, result *to);
+/* Fallback.keep, and brake; `at` may lack obstacles */
 void judge_inputs(scp_core *core, const step *at, const double *U, scp_status status, result *to);
+void judge_braking(scp_core *core, const step *at, scp_status status, result *to);
+size_t scratch_of_fallback(const scp_core *core);
 void lay_out_backup(scp_core *core, arena *from);
 void set_up_backup(scp_core *core);
 int backup_of(scp_core *core, const double *X, const double *U, double *inputs); /* steps, -1 for none */
 int backup_continued(scp_core *core, const double *x, const double *inputs, int count,
                      double *whole); /* whole (N, nu); 0 if it is not clear any more */
+int backup_always(const scp_core *core); /* whether there is one without any obstacle, too */
+size_t scratch_of_backup(const scp_core *core);
 
 /* ---- solver.c, controller.c, clock.c */
 

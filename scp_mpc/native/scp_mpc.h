@@ -89,6 +89,8 @@ typedef struct {
     scp_dynamics own;             /* SCP_OWN_MODEL */
     const double *Q, *R, *Qf;     /* (nx, nx), (nu, nu), (nx, nx) */
     const double *rest;           /* (nu,) equilibrium input */
+    const double *moving;         /* (8, nx) states at the origin at 2^-3 .. 2^4 m/s along the first
+                                   * axis, from which braking is tried out; NULL: it is not */
     const double *u_min, *u_max;  /* (nu,) */
     int limits_rates;
     const double *du_min, *du_max; /* (nu,) may be infinite */
@@ -101,6 +103,8 @@ typedef struct {
     scp_inflation inflation;
     double s_ref, s_min, s_max, s_weight;
     const double *sizes;          /* (M+1,) uniform size where J obstacles are there; NULL: s_ref */
+    const double *backup_sizes;   /* (M+1,) over the horizon of backups, 4 s if that is longer; NULL:
+                                   * as `sizes` */
     double joint_risk;            /* to be allocated iteratively; 0: no */
     double growth_time;           /* [s]; 0: the whole horizon */
     double slack_weight, state_slack_weight;
