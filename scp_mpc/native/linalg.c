@@ -1,8 +1,8 @@
 /* Memory and dense linear algebra, for sizes up to some hundreds.
  *
- * Loops are written so that a compiler vectorises them without being allowed to reorder sums: four
- * or sixteen sums side by side, the same on every machine. Matrices are stored row by row, so that
- * products with rows (dots) and sums of rows (axpys) are all there is.
+ * Matrices are stored row by row, so that products with rows (dots) and sums of rows (axpys) are all
+ * there is. Both are written so that a compiler vectorises them though it must not reorder sums:
+ * eight sums side by side, the same on every machine.
  *
  * Eigenvalues: Householder's tridiagonal form, then QL with implicit shifts (Golub and Van Loan,
  * Matrix Computations, chapter 8), vectors kept as rows until the end.
@@ -85,115 +85,42 @@ double largest_abs(int n, const double *a)
 
 /* ---- products */
 
-/* Products of a (n,) with four rows of b, `stride` apart. */
-static void dot4(int n, const double *restrict a, const double *restrict b, size_t stride,
-                 double *restrict to)
-{
-    const double *b1 = b + stride, *b2 = b1 + stride, *b3 = b2 + stride;
-    double s0[4] = {0}, s1[4] = {0}, s2[4] = {0}, s3[4] = {0};
-    int i = 0;
-    for (; i + 4 <= n; i += 4) {
-        for (int k = 0; k < 4; k++)
-            s0[k] += a[i + k] * b[i + k];
-        for (int k = 0; k < 4; k++)
-            s1[k] += a[i + k] * b1[i + k];
-        for (int k = 0; k < 4; k++)
-            s2[k] += a[i + k] * b2[i + k];
-        for (int k = 0; k < 4; k++)
-            s3[k] += a[i + k] * b3[i + k];
-    }
-    for (; i < n; i++) {
-        s0[0] += a[i] * b[i];
-        s1[0] += a[i] * b1[i];
-        s2[0] += a[i] * b2[i];
-        s3[0] += a[i] * b3[i];
-    }
-    to[0] = (s0[0] + s0[2]) + (s0[1] + s0[3]);
-    to[1] = (s1[0] + s1[2]) + (s1[1] + s1[3]);
-    to[2] = (s2[0] + s2[2]) + (s2[1] + s2[3]);
-    to[3] = (s3[0] + s3[2]) + (s3[1] + s3[3]);
-}
-
-/* y = A x, rows of A `stride` apart */
-static void multiply(int m, int n, const double *restrict A, size_t stride,
-                     const double *restrict x, double *restrict y)
+/* y += A'x, rows of A `apart`, entries of x `stride`: four rows at a time, to load y less often */
+static void gather(int m, int n, const double *restrict A, size_t apart, const double *restrict x,
+                   size_t stride, double *restrict y)
 {
     int i = 0;
-    for (; i + 4 <= m; i += 4)
-        dot4(n, x, A + (size_t)i * stride, stride, y + i);
-    for (; i < m; i++)
-        y[i] = dot(n, A + (size_t)i * stride, x);
-}
-
-/* y += A'x, likewise */
-static void gather(int m, int n, const double *restrict A, size_t stride,
-                   const double *restrict x, double *restrict y)
-{
-    int i = 0;
-    for (; i + 4 <= m; i += 4) {
-        const double *a0 = A + (size_t)i * stride, *a1 = a0 + stride;
-        const double *a2 = a1 + stride, *a3 = a2 + stride;
-        double x0 = x[i], x1 = x[i + 1], x2 = x[i + 2], x3 = x[i + 3];
+    for (; i + 4 <= m; i += 4, A += 4 * apart, x += 4 * stride) {
+        const double *a1 = A + apart, *a2 = a1 + apart, *a3 = a2 + apart;
+        double x0 = x[0], x1 = x[stride], x2 = x[2 * stride], x3 = x[3 * stride];
         for (int k = 0; k < n; k++)
-            y[k] += (x0 * a0[k] + x1 * a1[k]) + (x2 * a2[k] + x3 * a3[k]);
+            y[k] += (x0 * A[k] + x1 * a1[k]) + (x2 * a2[k] + x3 * a3[k]);
     }
-    for (; i < m; i++)
-        axpy(n, x[i], A + (size_t)i * stride, y);
+    for (; i < m; i++, A += apart, x += stride)
+        axpy(n, x[0], A, y);
 }
 
 void gemv(int m, int n, const double *A, const double *x, double *y)
 {
-    multiply(m, n, A, (size_t)n, x, y);
+    for (int i = 0; i < m; i++)
+        y[i] = dot(n, A + (size_t)i * (size_t)n, x);
 }
 
 void gemv_t(int m, int n, const double *A, const double *x, double *y)
 {
     for (int i = 0; i < n; i++)
         y[i] = 0;
-    gather(m, n, A, (size_t)n, x, y);
+    gather(m, n, A, (size_t)n, x, 1, y);
 }
 
-/* A block (4, 4) of C = A B from k terms; A(r, t) = a[r row + t stride]. */
-static void block(int k, const double *restrict a, size_t row, size_t stride,
-                  const double *restrict b, size_t n, double *restrict c)
+/* C = A B, with A(i, t) = A[i row + t column] */
+static void product(int m, int k, int n, const double *A, size_t row, size_t column,
+                    const double *B, double *C)
 {
-    double s0[4] = {0}, s1[4] = {0}, s2[4] = {0}, s3[4] = {0};
-    for (int t = 0; t < k; t++, a += stride, b += n) {
-        double a0 = a[0], a1 = a[row], a2 = a[2 * row], a3 = a[3 * row];
-        for (int j = 0; j < 4; j++)
-            s0[j] += a0 * b[j];
-        for (int j = 0; j < 4; j++)
-            s1[j] += a1 * b[j];
-        for (int j = 0; j < 4; j++)
-            s2[j] += a2 * b[j];
-        for (int j = 0; j < 4; j++)
-            s3[j] += a3 * b[j];
-    }
-    for (int j = 0; j < 4; j++) {
-        c[j] = s0[j];
-        c[n + (size_t)j] = s1[j];
-        c[2 * n + (size_t)j] = s2[j];
-        c[3 * n + (size_t)j] = s3[j];
-    }
-}
-
-static void product(int m, int k, int n, const double *restrict A, size_t row, size_t stride,
-                    const double *restrict B, double *restrict C)
-{
-    int whole_rows = m - m % 4, whole_columns = n - n % 4;
-    size_t width = (size_t)n;
-    for (int i = 0; i < whole_rows; i += 4)
-        for (int j = 0; j < whole_columns; j += 4)
-            block(k, A + (size_t)i * row, row, stride, B + j, width, C + (size_t)i * width + j);
-    for (int i = 0; i < m; i++) {
-        int from = i < whole_rows ? whole_columns : 0;
-        double *c = C + (size_t)i * width;
-        for (int j = from; j < n; j++)
-            c[j] = 0;
-        if (from < n)
-            for (int t = 0; t < k; t++)
-                axpy(n - from, A[(size_t)i * row + (size_t)t * stride],
-                     B + (size_t)t * width + from, c + from);
+    for (int i = 0; i < m; i++, A += row, C += n) {
+        for (int j = 0; j < n; j++)
+            C[j] = 0;
+        gather(k, n, B, (size_t)n, A, column, C);
     }
 }
 
@@ -210,7 +137,7 @@ void gemm_tn(int k, int m, int n, const double *A, const double *B, double *C)
 void gemm_nt(int m, int k, int n, const double *A, const double *B, double *C)
 {
     for (int i = 0; i < m; i++)
-        multiply(n, k, B, (size_t)k, A + (size_t)i * (size_t)k, C + (size_t)i * (size_t)n);
+        gemv(n, k, B, A + (size_t)i * (size_t)k, C + (size_t)i * (size_t)n);
 }
 
 /* ---- triangular factors */
@@ -220,22 +147,9 @@ int cholesky(int n, double *A)
     size_t width = (size_t)n;
     for (int i = 0; i < n; i++) {
         double *row = A + (size_t)i * width;
-        for (int j = 0; j < i;) { /* four at once: first what is common to them */
-            int four = j + 4 <= i ? 4 : i - j;
-            double common[4] = {0};
-            if (four == 4 && j)
-                dot4(j, row, A + (size_t)j * width, width, common);
-            else
-                for (int k = 0; k < four; k++)
-                    common[k] = dot(j, row, A + (size_t)(j + k) * width);
-            for (int k = 0; k < four; k++) {
-                const double *other = A + (size_t)(j + k) * width;
-                double left = row[j + k] - common[k];
-                for (int t = j; t < j + k; t++)
-                    left -= row[t] * other[t];
-                row[j + k] = left / other[j + k];
-            }
-            j += four;
+        for (int j = 0; j < i; j++) {
+            const double *other = A + (size_t)j * width;
+            row[j] = (row[j] - dot(j, row, other)) / other[j];
         }
         double left = row[i] - dot(i, row, row);
         if (!(left > 0 && left <= DBL_MAX)) /* or NaN */
@@ -274,7 +188,7 @@ void invert_lower(int n, const double *L, double *inverse)
             to[j] = 0;
         for (int j = 0; j < i; j += 16) { /* rows of the inverse grow: few zeros are added */
             int some = j + 16 <= i ? 16 : i - j;
-            gather(some, j + some, inverse + (size_t)j * width, width, row + j, to);
+            gather(some, j + some, inverse + (size_t)j * width, width, row + j, 1, to);
         }
         scale(i, -1 / row[i], to);
         to[i] = 1 / row[i];
@@ -298,11 +212,10 @@ void eigen_small(int d, const double *A, double *values, double *vectors)
         int turned = 0;
         for (int p = 0; p < d - 1; p++)
             for (int q = p + 1; q < d; q++) {
-                double off = a[p * d + q], gap = a[q * d + q] - a[p * d + p];
-                if (!(fabs(off) > DBL_MIN) || (sweep > 3 && fabs(off) < DBL_EPSILON * DBL_EPSILON
-                    * (fabs(a[p * d + p]) + fabs(a[q * d + q]))))
+                double off = a[p * d + q], first = a[p * d + p], second = a[q * d + q];
+                if (!(fabs(off) > DBL_EPSILON / 4 * sqrt(fabs(first * second)) + DBL_MIN))
                     continue;
-                double theta = gap / (2 * off);
+                double theta = (second - first) / (2 * off);
                 double t = 1 / (fabs(theta) + sqrt(theta * theta + 1));
                 t = theta < 0 ? -t : t;
                 double c = 1 / sqrt(t * t + 1), s = t * c;
@@ -357,7 +270,8 @@ static void tridiagonal(int n, double *A, double *diagonal, double *off, double 
         beta[k] = 2 / (first * first + rest);
         v[0] = first;
         double *within = A + (size_t)(k + 1) * width + k + 1;
-        multiply(left, left, within, width, v, work);
+        for (int i = 0; i < left; i++)
+            work[i] = dot(left, within + (size_t)i * width, v);
         scale(left, beta[k], work);
         axpy(left, -beta[k] / 2 * dot(left, v, work), v, work);
         for (int i = 0; i < left; i++) {
