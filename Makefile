@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
+SOURCES := pyproject.toml hatch_build.py $(wildcard scp_mpc/native/*.[ch])
 
 .PHONY: demo test test-all check format bench risk safety soak wind clean
 
@@ -43,11 +44,11 @@ wind: $(VENV)/.dev  ## tracking under wind, with and without disturbance rejecti
 clean:
 	rm -rf $(VENV) $(OUT) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
-$(VENV)/.demo: pyproject.toml | $(VENV)
+$(VENV)/.demo: $(SOURCES) | $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[cli]"
 	touch $@
 
-$(VENV)/.dev: pyproject.toml | $(VENV)
+$(VENV)/.dev: $(SOURCES) | $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	touch $@ $(VENV)/.demo
 

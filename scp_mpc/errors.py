@@ -55,6 +55,19 @@ class MissingExtraError(ScpMpcError, ImportError):
     """An optional package is not installed; it names the extra that brings it along."""
 
 
+class MissingCoreError(InvalidArgumentError):
+    """The native core is asked for and not there; it says why, and how to get it."""
+
+    def __init__(self, reason: str) -> None:
+        remedy = (
+            "It is compiled when the package is installed: install a C compiler, for example by "
+            "`apt install gcc`, or unset SCP_MPC_PURE and SCP_MPC_NO_ZIG, and install scp-mpc "
+            "from source again, by `pip install --force-reinstall --no-deps .` in a clone"
+        )
+        super().__init__("solver", f"'native' is not there: {reason}. {remedy}")
+        self.reason = reason
+
+
 class ConcurrentUseError(ScpMpcError):
     """One solver was called from two threads at once; each needs its own."""
 

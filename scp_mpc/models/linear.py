@@ -124,6 +124,27 @@ class LinearModel(Model):
         rows = np.ascontiguousarray(self._power(fraction)[self.position])
         return rows[:, : self.nx], rows[:, self.nx :]
 
+    def within(self, instants: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return how K instants of an interval, the last of which is its end, depend on x and u.
+
+        Args:
+            instants: K.
+
+        Returns:
+            C ((K-1) d, nx) and D ((K-1) d, nu) of the positions before the end; and (K d, nx) and
+            (K d, nu) of how far a held input bends the way off the chord, in the middle between
+            two instants.
+        """
+        K = instants
+        maps = [self.between(k / (2 * K)) for k in range(2 * K + 1)]
+        by_x, by_u = (np.array([m[part] for m in maps]) for part in (0, 1))
+        C, D = (part[2:-1:2].reshape(-1, part.shape[2]) for part in (by_x, by_u))
+        bend_x, bend_u = (
+            (part[1::2] - (part[:-1:2] + part[2::2]) / 2).reshape(-1, part.shape[2])
+            for part in (by_x, by_u)
+        )
+        return C, D, bend_x, bend_u
+
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return states (..., nx) there whose position moves by dt times the velocity if u = 0.
 

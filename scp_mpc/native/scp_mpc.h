@@ -197,11 +197,13 @@ SCP_API scp_core *scp_setup(const scp_problem *problem, void *block, size_t size
 SCP_API scp_inputs *scp_in(scp_core *core);
 SCP_API const scp_outputs *scp_out(const scp_core *core);
 
-/* The plan to start from, for scp_solve: write into it and say so. */
+/* For scp_solve: the plan to start from, and the one that ignores the obstacles, where another one
+ * was found. Write into them and say how many. */
 SCP_API scp_iterate *scp_guess(scp_core *core);
+SCP_API scp_iterate *scp_guess_free(scp_core *core);
 
 /* 0, or a positive number if an input is wrong (which one: scp_input_name), and nothing happened. */
-SCP_API int scp_solve(scp_core *core, int has_guess);
+SCP_API int scp_solve(scp_core *core, int guesses);
 SCP_API const char *scp_input_name(int number);
 
 /* The same with memory: starts from the last plan, shifted, keeps a backup. scp_reset forgets. */

@@ -184,13 +184,11 @@ class LinearNodes(Nodes):
         """Find the positions' dependence on state and input."""
         super().__init__(model, horizon, instants)
         K, d = instants, len(self._position)
-        maps = [model.between(k / (2 * K)) for k in range(2 * K + 1)]
-        by_x, by_u = (np.array([m[part] for m in maps]) for part in (0, 1))
-        self._C, self._D = (part[2:-1:2].reshape(-1, part.shape[2]) for part in (by_x, by_u))
-        bend_x, bend_u = (part[1::2] - (part[:-1:2] + part[2::2]) / 2 for part in (by_x, by_u))
-        self._bend = bend_x.reshape(K * d, -1).T, bend_u.reshape(K * d, -1).T
+        self._C, self._D, *bend = model.within(K)
+        self._bend = bend[0].T, bend[1].T
         none = np.zeros(model.nu) if most is None else most
-        self._most = float(np.linalg.norm(np.abs(bend_u) @ none, axis=1).max())
+        most_bent = np.abs(bend[1].reshape(K, d, -1)) @ none
+        self._most = float(np.linalg.norm(most_bent, axis=1).max())
         at = np.zeros((horizon, d, model.nx))
         at[:, np.arange(d), self._position] = 1.0
         C, D = (np.repeat(part[None], horizon, axis=0) for part in (self._C, self._D))

@@ -13,7 +13,7 @@ FLOORS = [
     {"models", "obstacles", "settings"},
     {"geometry"},
     {"problem"},
-    {"qp"},
+    {"qp", "native"},
     {"scp"},
     {"control", "tracking"},
     {"simulation"},

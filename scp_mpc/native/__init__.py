@@ -1,0 +1,1 @@
+"""The native core: one control step in C99, and its ctypes binding."""

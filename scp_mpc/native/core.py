@@ -1,0 +1,381 @@
+"""The native core at work: a problem laid out in one block of memory, and views of what is in it.
+
+    write what a step brings into the views of the inputs
+    one call                                        the GIL is free meanwhile
+    take what came out: one copy of numbers, unpacked when they are asked for
+
+Notation as in `scp_mpc.h`.
+"""
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from scp_mpc.arrays import FloatArray
+from scp_mpc.deadline import Timer
+from scp_mpc.errors import InvalidArgumentError
+from scp_mpc.models.model import Model
+from scp_mpc.native.constants import constants
+from scp_mpc.native.library import (
+    OWN_MODEL,
+    Advance,
+    Clock,
+    Curvature,
+    IterateStruct,
+    Linearise,
+    Outputs,
+    ProblemStruct,
+    StoppingInput,
+    library,
+)
+from scp_mpc.obstacles.solid import Solid
+from scp_mpc.problem import Problem
+from scp_mpc.settings import Settings
+
+_ALIGNED = 64  # bytes
+
+
+@dataclass(frozen=True)
+class IterateLayout:
+    """Where the arrays of a `scp_iterate` are, in doubles from the first of them.
+
+    Attributes:
+        address: Of the first.
+        size: From there to the end of the last one.
+        places: Where each begins, and its shape, by name.
+    """
+
+    address: int
+    size: int
+    places: dict[str, tuple[int, tuple[int, ...]]]
+
+    @classmethod
+    def of(cls, struct: IterateStruct, shapes: dict[str, tuple[int, ...]]) -> "IterateLayout":
+        """Read the addresses."""
+        there = {name: _address(getattr(struct, name)) for name in shapes}
+        first = min(at for name, at in there.items() if np.prod(shapes[name]))
+        places = {
+            name: ((there[name] - first) // 8 if np.prod(shape) else 0, shape)
+            for name, shape in shapes.items()
+        }
+        return cls(first, max(at + int(np.prod(s)) for at, s in places.values()), places)
+
+    def part(self, numbers: FloatArray, name: str) -> FloatArray:
+        """One of the arrays within all of their numbers (size,)."""
+        at, shape = self.places[name]
+        return numbers[at : at + int(np.prod(shape))].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a step of the core came to, copied out of it.
+
+    Attributes:
+        outputs: The members of `scp_outputs`; its pointers lead nowhere.
+        plan: Numbers of its plan, by `layout`.
+        obstacle_free: Likewise; None where there is none.
+        layout: Where which array is in each of them.
+    """
+
+    raw: bytes
+    plan: FloatArray
+    obstacle_free: FloatArray | None
+    layout: tuple[IterateLayout, IterateLayout]
+
+    @property
+    def outputs(self) -> Outputs:
+        """See above."""
+        return Outputs.from_buffer_copy(self.raw)
+
+
+class NativeCore:
+    """One problem and its settings, laid out once.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+        deadline: Of a step [s]; None for none.
+        timer: Tells the time [s] to deadlines; None for the machine's clock.
+
+    Attributes:
+        inputs: The struct of a step's inputs; its arrays are in `views`.
+        outputs: The struct of what came out.
+        views: The arrays of the inputs by name, to be written into.
+        guess: The arrays of the plan to start from, by name; `guess_free` those of the plan that
+            ignores the obstacles.
+
+    Raises:
+        MissingCoreError: There is no library.
+        InvalidArgumentError: The core refuses the problem; says which number of it.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: Settings,
+        deadline: float | None = None,
+        timer: Timer | None = None,
+    ) -> None:
+        """Hand the numbers over and lay everything out."""
+        self._call = library()
+        self._error: BaseException | None = None
+        values = constants(problem, settings, deadline)
+        struct, self._kept = _filled(values)
+        if values["model"] == OWN_MODEL:
+            self._bind(struct, problem.model)
+        if deadline is not None:
+            struct.clock = self._clock(timer)
+            self._kept.append(struct.clock)
+        wrong = self._call.scp_check(struct)
+        if wrong:
+            name = self._call.scp_name(wrong).decode()
+            raise InvalidArgumentError(name, "is refused by the native core")
+        size = self._call.scp_size(struct)
+        self._block = np.zeros(size + _ALIGNED, dtype=np.uint8)
+        begin = self._block.ctypes.data
+        self._core = self._call.scp_setup(struct, begin + -begin % _ALIGNED, size)
+        self._raise()
+        if not self._core:
+            raise InvalidArgumentError("problem", f"cannot be set up in {size} bytes")
+        self.bytes = size
+        self._look(problem, values)
+
+    def _look(self, problem: Problem, values: dict[str, Any]) -> None:
+        """Make the views."""
+        model, N, M = problem.model, problem.horizon, problem.max_obstacles
+        d, nb = model.dim, len(problem.state_rows)
+        C = N * problem.nodes_per_interval * len(problem.discs)
+        P, V, F, E = (values[f"max_{name}"] for name in ("shapes", "corners", "faces", "edges"))
+        self.inputs = self._call.scp_in(self._core).contents
+        self.outputs = self._call.scp_out(self._core).contents
+        self._at_outputs = ctypes.addressof(self.outputs)
+        self._parts = {
+            "x0": (model.nx,),
+            "x_ref": (N + 1, model.nx),
+            "u_last": (model.nu,),
+            "means": (M, N + 1, d),
+            "covariances": (M, N + 1, d, d),
+            "radii": (M,),
+            "shape": (M,),
+            "corners": (P,),
+            "faces": (P,),
+            "edges": (P,),
+            "corner": (P, V, d),
+            "normal": (P, F, d),
+            "offset": (P, F),
+            "edge": (P, E, 2),
+            "robot_covariance": (N + 1, d, d),
+        }
+        self.views = {name: _view(self.inputs, name, s) for name, s in self._parts.items()}
+        iterate: dict[str, tuple[int, ...]] = {
+            "states": (N + 1, model.nx),
+            "inputs": (N, model.nu),
+            "s": (M,),
+            "slack": (M, C),
+            "dynamics": (N, model.nx),
+            "input_bounds": (N, model.nu),
+            "margin": (M,),
+            "obstacles": (M, C),
+            "pins": (M, C),
+            "state_bounds": (N, nb),
+            "rates": (N, model.nu),
+        }
+        self._guesses = [
+            call(self._core).contents for call in (self._call.scp_guess, self._call.scp_guess_free)
+        ]
+        self.guess, self.guess_free = (
+            {name: _view(struct, name, shape) for name, shape in iterate.items()}
+            for struct in self._guesses
+        )
+        self._layout = (
+            IterateLayout.of(self.outputs.plan, iterate),
+            IterateLayout.of(self.outputs.obstacle_free, iterate),
+        )
+        self._plans = [_numbers(layout.address, layout.size) for layout in self._layout]
+        self._solids: list[Solid] = []
+
+    def set_shapes(self, shapes: Sequence[Solid | None]) -> None:
+        """Say which obstacles are polytopes, and write those that are new.
+
+        Raises:
+            InvalidArgumentError: One has more corners, faces or edges than there is room for.
+        """
+        number = {id(solid): k for k, solid in enumerate(self._solids)}
+        solids = list({id(s): s for s in shapes if s is not None}.values())
+        if not all(id(solid) in number for solid in solids):
+            self._write(solids)
+            number = {id(solid): k for k, solid in enumerate(solids)}
+        for j, solid in enumerate(shapes):
+            self.views["shape"][j] = -1 if solid is None else number[id(solid)]
+
+    def _write(self, solids: list[Solid]) -> None:
+        self._solids = []
+        parts = ("corner", "vertices"), ("face", "normals"), ("edge", "edges")
+        for k, solid in enumerate(solids):
+            for what, name in parts:
+                count = len(getattr(solid, name))
+                most = self.views["normal" if what == "face" else what].shape[1]
+                if count > most:
+                    raise InvalidArgumentError("shape", f"{count} {what}s, room for {most}")
+                self.views[what + "s"][k] = count
+            self.views["corner"][k, : len(solid.vertices)] = solid.vertices
+            self.views["normal"][k, : len(solid.normals)] = solid.normals
+            self.views["offset"][k, : len(solid.offsets)] = solid.offsets
+            self.views["edge"][k, : len(solid.edges)] = solid.edges
+        self._solids = solids
+        self.inputs.shapes = len(solids)
+
+    def solve(self, guesses: int, multi_start: bool, brake_first: bool) -> str | None:
+        """Solve one step; return the name of an input that is refused, None if none is.
+
+        Args:
+            guesses: How many of `guess` and `guess_free` have been written.
+            multi_start: Whether to look for other ways past the obstacles.
+            brake_first: Whether braking comes before the last plan.
+        """
+        self.inputs.multi_start, self.inputs.brake_first = multi_start, brake_first
+        return self._done(self._call.scp_solve(self._core, guesses))
+
+    def step(self) -> str | None:
+        """`solve` with memory: from the last plan, with its backup."""
+        return self._done(self._call.scp_step(self._core))
+
+    def reset(self) -> None:
+        """Forget the steps before."""
+        self._call.scp_reset(self._core)
+
+    def has_multipliers(self, *known: bool) -> None:
+        """Say whether `guess` and `guess_free` have multipliers."""
+        for struct, has in zip(self._guesses, known, strict=False):
+            struct.has_multipliers = has
+
+    def outcome(self) -> Outcome:
+        """Copy what came out."""
+        free = self._plans[1].copy() if self.outputs.has_obstacle_free else None
+        raw = ctypes.string_at(self._at_outputs, ctypes.sizeof(Outputs))
+        return Outcome(raw, self._plans[0].copy(), free, self._layout)
+
+    def _done(self, wrong: int) -> str | None:
+        self._raise()
+        return self._call.scp_input_name(wrong).decode() if wrong else None
+
+    def _raise(self) -> None:
+        """Go on with what went wrong in Python while the core asked for it."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _guarded(self, function: Callable[..., None]) -> Callable[..., int]:
+        """A callback that keeps what is raised, and says that there is no value.
+
+        Where a model has no value, as at a singular point, the core goes on without one.
+        """
+
+        def call(*arguments: Any) -> int:
+            try:
+                function(*arguments)
+            except (ArithmeticError, np.linalg.LinAlgError):
+                return 1
+            except BaseException as error:  # nothing may pass through the core
+                self._error = self._error or error
+                return 1
+            return 0
+
+        return call
+
+    def _bind(self, struct: ProblemStruct, model: Model) -> None:
+        """Let the core ask a model of Python's."""
+        nx, nu = model.nx, model.nu
+        n = nx + nu
+
+        def points(count: int, x: int, u: int) -> tuple[FloatArray, FloatArray]:
+            # Copies: what a user's function does with them is its own business.
+            return _at(x, count, nx).copy(), _at(u, count, nu).copy()
+
+        def advance(_: Any, count: int, x: int, u: int, share: float, after: int) -> None:
+            states, inputs = points(count, x, u)
+            if count == 1 and share == 1.0:
+                _at(after, nx)[:] = model.step(states[0], inputs[0])
+            else:
+                _at(after, count, nx)[:] = model.advance(states, inputs, share)
+
+        def linearise(
+            _: Any, count: int, x: int, u: int, share: float, after: int, A: int, B: int
+        ) -> None:
+            there = model.linearise(*points(count, x, u), share)
+            _at(after, count, nx)[:] = there.after
+            _at(A, count, nx, nx)[:] = there.A
+            _at(B, count, nx, nu)[:] = there.B
+
+        def curvature(
+            _: Any, count: int, x: int, u: int, costates: int, share: float, bent: int
+        ) -> None:
+            weights = _at(costates, count, nx).copy()
+            found = model.curvature(*points(count, x, u), weights, share)
+            _at(bent, count, n, n)[:] = found
+
+        def stopping_input(_: Any, x: int, u: int) -> None:
+            _at(u, nu)[:] = model.stopping_input(_at(x, nx).copy())
+
+        struct.own.advance = Advance(self._guarded(advance))
+        struct.own.linearise = Linearise(self._guarded(linearise))
+        struct.own.curvature = Curvature(self._guarded(curvature))
+        struct.own.stopping_input = StoppingInput(self._guarded(stopping_input))
+        self._kept.append(struct.own)
+
+    def _clock(self, timer: Timer | None) -> Any:
+        if timer is None:
+            return ctypes.cast(self._call.scp_machine_clock, Clock)
+
+        def now(_: Any) -> float:
+            try:
+                return timer()
+            except BaseException as error:
+                self._error = self._error or error
+                return np.inf
+
+        return Clock(now)
+
+
+def _filled(values: dict[str, Any]) -> tuple[ProblemStruct, list[Any]]:
+    """The struct, and what has to stay as long as it is used."""
+    struct, kept = ProblemStruct(), list[Any]()
+    for name, kind in ProblemStruct._fields_:
+        value = values.get(name)
+        if isinstance(value, np.ndarray):
+            value = np.ascontiguousarray(value)
+            kept.append(value)
+            value = value.ctypes.data_as(kind)
+        if value is not None:
+            setattr(struct, name, value)
+    return struct, kept
+
+
+def _address(pointer: Any) -> int:
+    return ctypes.cast(pointer, ctypes.c_void_p).value or 0
+
+
+def _view(struct: Any, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    """The array that a member points to."""
+    pointer = getattr(struct, name)
+    kind: DTypeLike = np.float64 if pointer._type_ is ctypes.c_double else np.intc
+    if not np.prod(shape):
+        return np.zeros(shape, kind)
+    return np.ctypeslib.as_array(pointer, shape)
+
+
+def _numbers(address: int, count: int) -> FloatArray:
+    buffer: Any = (ctypes.c_double * count).from_address(address)
+    return np.frombuffer(buffer)
+
+
+def _at(address: int, *shape: int) -> FloatArray:
+    """The numbers at an address, for the time of a callback."""
+    size = 1
+    for length in shape:
+        size *= length
+    return _numbers(address, size).reshape(shape)
