@@ -238,7 +238,20 @@ typedef struct {
     qp qp;
     double *lower, *upper, *b, *l1_weight; /* storage of qp's */
     int *at;
+    double *W;              /* (nv, nv) what the program leaves out, where its convex solution is; */
+    int bent;               /* whether it is there: newton.c's curvature() */
 } program;
+
+typedef enum { PROGRAM_SOLVED, PROGRAM_UNSOLVED, PROGRAM_LATE } program_end;
+
+/* What all runs of the loop work with, one after the other. */
+typedef struct {
+    program program;
+    sensitivity by;         /* of a nonlinear robot */
+    solution convex;
+    uint8_t *nobody;        /* (M, C) no pair at all */
+    double *full;           /* (M,) sizes as they are wanted */
+} workspace;
 
 /* ---- time: deadline.py */
 
@@ -298,6 +311,9 @@ struct scp_core {
     double *drift;             /* (N, nx) condensing.py's _drift */
     int *reach;                /* (ny,) inputs that come before an output: a row of S is zero from
                                 * there to n, where the sizes begin */
+
+    int broken;                /* whether a computation broke down in this step */
+    workspace *work;
 
     void *models, *geometry, *condensing, *active, *certify, *loop, *newton, *start, *candidates,
         *fallback, *backup, *solver, *memory, *steps; /* what the parts keep for themselves */
@@ -460,35 +476,70 @@ double dual_bound(scp_core *core, const qp *of, const double *force);
 void violations(scp_core *core, const qp *of, const double *v, double *depth, int8_t *side);
 void qp_row(const qp *of, int i, double *row); /* (nv,), in v */
 
-/* ---- loop.c, newton.c: scp/loop.py, transcription.py, trust_region.py, newton.py */
+/* ---- transcription.c; transcription.py, iterate.py, qp/backend.py */
 
-void lay_out_loop(scp_core *core, arena *from);
+void lay_out_transcription(scp_core *core, arena *from);
+void set_up_transcription(scp_core *core);
+size_t scratch_of_transcription(const scp_core *core);
 void lay_out_program(const scp_core *core, arena *from, program *p);
-void begin_loop(scp_core *core);
-/* Descend from a plan. `goal` and `about` may be NULL; limit 0: the settings'. to->there: whether. */
-void run_loop(scp_core *core, const nominal *start, const result *goal, const double *about_y,
-              int limit, int hard, result *to);
-void judge_nominal(scp_core *core, const nominal *n, relaxation level, int iterations, result *to);
+void begin_transcription(scp_core *core);
+void make_pairs(const scp_core *core, const uint8_t *near, pairs *to);
+void near_pairs(scp_core *core, const double *y, const uint8_t *known, uint8_t *near);
+int screen(scp_core *core, const nominal *plan, uint8_t *near);
+void with_pairs(scp_core *core, const nominal *plan, const uint8_t *near, nominal *to);
+/* y and roll of clipped inputs and sizes; 0, or no numbers, like the next two */
+int rolled(scp_core *core, const double *U, const double *s, const double *guess_e, nominal *to);
+int plain_nominal(scp_core *core, const double *U, const double *guess_e, nominal *to); /* no pairs */
 /* an iterate's inputs rolled out from the state now; near (J, C) or NULL for those near it */
 int nominal_at(scp_core *core, const scp_iterate *it, const uint8_t *near, const double *about_y,
                nominal *to);
-int plain_nominal(scp_core *core, const double *U, const double *guess_e, nominal *to); /* no pairs */
-/* y and roll of clipped inputs and sizes */
-int rolled(scp_core *core, const double *U, const double *s, const double *guess_e, nominal *to);
-void make_pairs(const scp_core *core, const uint8_t *near, pairs *to);
-void near_pairs(const scp_core *core, const double *y, const uint8_t *known, uint8_t *near);
+void judge_plan(scp_core *core, nominal *n, const uint8_t *yields, relaxation level);
 int obstacle_free_optimum(scp_core *core, const scp_iterate *guess, nominal *to); /* 1: found */
-void iterate_outputs(scp_core *core, const scp_iterate *it, double *y);
-void name_iterate(scp_core *core, const nominal *n, double l1_weight, scp_iterate *to);
 double merit_of(const scp_core *core, double cost, double slack, const double *excess);
+/* bounds (ny,) of y; whether they are others than the step's own */
 int relaxed_bounds(const scp_core *core, relaxation level, const double **lower, const double **upper);
+int relaxes(const scp_core *core, relaxation *level, int hard);
 void write_program(scp_core *core, const nominal *about, const condensed *c, const planes *at,
                    relaxation level, const double *radius, program *to);
-int refine(scp_core *core, const program *p, const solution *convex, solution *to); /* newton.refined */
+void guess_active(const program *p, const double *reaction, const double *force, solution *to);
+program_end solve_program(scp_core *core, const program *p, const nominal *from, solution *to);
+void certified(scp_core *core, const program *p, const solution *s, nominal *to);
+void states_of(const scp_core *core, const rollout *roll, double *X);
+void iterate_outputs(scp_core *core, const scp_iterate *it, double *y);
+void name_iterate(const scp_core *core, const nominal *n, double l1_weight, scp_iterate *to);
+int touches(const scp_core *core, const scp_iterate *it);
+
+/* ---- loop.c; loop.py, trust_region.py */
+
+void lay_out_loop(scp_core *core, arena *from);
+void set_up_loop(scp_core *core);
+size_t scratch_of_loop(const scp_core *core);
+/* Descend from a plan. `goal` and `about` may be NULL; limit 0: the settings'. to->there: whether. */
+void run_loop(scp_core *core, const nominal *start, const result *goal, const double *about_y,
+              int limit, int hard, result *to);
+/* `n` may be to->at */
+void judge_nominal(scp_core *core, const nominal *n, relaxation level, int iterations, result *to);
+int beats(const result *one, const result *other, double lead);
+
+/* ---- newton.c; newton.py, transcription.py's curvature */
+
+void lay_out_newton(scp_core *core, arena *from);
+size_t scratch_of_newton(const scp_core *core);
+/* Solutions that are valid until the next call. */
+const solution *refine(scp_core *core, program *p, const solution *convex);
+const solution *second_order_correction(scp_core *core, const program *p, const solution *s,
+                                        const nominal *trial);
+nominal *restored(scp_core *core, const nominal *plan, nominal *spare, nominal *other); /* or NULL */
+double bent_by(scp_core *core, program *p, const solution *convex, const double *v); /* d'W d / 2 */
+void second_order(scp_core *core, const program *p, const solution *s, nominal *plan,
+                  double *direction); /* (N, nu) */
+int negative_curvature_step(scp_core *core, const nominal *saddle, const double *direction,
+                            nominal *to);
 
 /* ---- start.c: manoeuvres.py; multi_start.c, candidates.c */
 
 int manoeuvres(scp_core *core, int most, double *U); /* how many; U (most, N, nu) */
+size_t scratch_of_start(const scp_core *core);
 size_t scratch_of_candidates(const scp_core *core);
 typedef struct {
     int obstacle, waits;
@@ -502,6 +553,9 @@ int same_pattern(const scp_core *core, const double *path_a, const uint8_t *touc
                  const double *path_b, const uint8_t *touched_b); /* (C, d), (J, C) */
 void lay_out_multi_start(scp_core *core, arena *from);
 int multi_start_wanted(const scp_core *core, const result *best, int due);
+void set_up_multi_start(scp_core *core);
+size_t scratch_of_multi_start(const scp_core *core);
+/* `best` is replaced if another one wins; uses the alternatives of the step before. */
 void multi_start(scp_core *core, result *best, const double *free_path, int has_last);
 
 /* ---- fallback.c, backup.c */
@@ -524,6 +578,9 @@ size_t scratch_of_backup(const scp_core *core);
 /* ---- solver.c, controller.c, clock.c */
 
 void lay_out_solver(scp_core *core, arena *from);
+size_t scratch_of_solver(const scp_core *core);
+void lay_out_controller(scp_core *core, arena *from);
+size_t scratch_of_controller(const scp_core *core);
 void solve_step(scp_core *core, const scp_iterate *last, const scp_iterate *last_free, int multi,
                 int brake_first);
 void shift_iterate(const scp_core *core, scp_iterate *it); /* in place: one step later */
@@ -532,8 +589,8 @@ void begin_clock(scp_core *core);
 double elapsed(const scp_core *core);
 int allows(scp_core *core, task what);
 int room_for(scp_core *core, task what, int most, task then, int spare);
-typedef struct { double began, booked; } mark;
-mark mark_time(const scp_core *core);
-void learn_time(scp_core *core, task what, mark since, int times);
+typedef struct { double began, booked; } lap;
+lap mark_time(const scp_core *core);
+void learn_time(scp_core *core, task what, lap since, int times);
 
 #endif
