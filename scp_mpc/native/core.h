@@ -425,6 +425,7 @@ double plan_penalty(const scp_core *core, const double *slack, const double *X);
 
 void lay_out_condensing(scp_core *core, arena *from);
 void set_up_condensing(scp_core *core);
+void lay_out_sensitivity(const scp_core *core, arena *from, sensitivity *by);
 void lay_out_nominal(const scp_core *core, arena *from, nominal *n);
 void copy_nominal(const scp_core *core, const nominal *from, nominal *to);
 void lay_out_result(const scp_core *core, arena *from, result *r);
