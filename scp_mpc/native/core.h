@@ -297,10 +297,11 @@ struct scp_core {
     step plain, wide;          /* radii as given; with room for what happens between nodes */
     step *now;                 /* the one that counts just now */
     double *x_ref;             /* (N+1, nx) unwrapped */
+    predictions given;         /* as they came */
     solid *solids;             /* (max_shapes,) */
     double *lower, *upper;     /* (ny,) bounds of y */
     double *strict_lower, *strict_upper; /* those outside their bounds now as far as braking goes */
-    double *braked_lower, *braked_upper; /* all hard ones so */
+    double *braked_lower, *braked_upper; /* all hard ones so; see brake_bounds */
     double *braking_u, *braking_x; /* (N, nu), (N+1, nx) braking from now on; see brake_now */
     int braking_steps;             /* -1: not computed yet */
     double *row_price;         /* (N nb,) price of a state's excess in merits */
@@ -398,6 +399,8 @@ int read_step(scp_core *core);
 void lay_out_room(const scp_core *core, arena *from, nodes of, step_room *room);
 void predict(const scp_core *core, const predictions *given, const double *robot_covariance,
              double scale, step_room *room, step *to); /* all of a step but x0, x_ref and u_last */
+void brake_bounds(scp_core *core); /* core->braked_*, once a step */
+double largest_variance(int d, const double *Sigma);
 /* node i counts from 0 = now: `path` is (C+1, d) */
 int within(const scp_core *core, const step *at, const double *path, const double *s,
            double distance, const uint8_t *known, uint8_t *near); /* how many; near (J, C) */
@@ -498,8 +501,8 @@ void judge_plan(scp_core *core, nominal *n, const uint8_t *yields, relaxation le
 int obstacle_free_optimum(scp_core *core, const scp_iterate *guess, nominal *to); /* 1: found */
 double merit_of(const scp_core *core, double cost, double slack, const double *excess);
 /* bounds (ny,) of y; whether they are others than the step's own */
-int relaxed_bounds(const scp_core *core, relaxation level, const double **lower, const double **upper);
-int relaxes(const scp_core *core, relaxation *level, int hard);
+int relaxed_bounds(scp_core *core, relaxation level, const double **lower, const double **upper);
+int relaxes(scp_core *core, relaxation *level, int hard);
 void write_program(scp_core *core, const nominal *about, const condensed *c, const planes *at,
                    relaxation level, const double *radius, program *to);
 void guess_active(const program *p, const double *reaction, const double *force, solution *to);
@@ -561,12 +564,13 @@ void multi_start(scp_core *core, result *best, const double *free_path, int has_
 
 /* ---- fallback.c, backup.c */
 
-void lay_out_fallback(scp_core *core, arena *from);
 void fall_back(scp_core *core, const step *at, const scp_iterate *last, const result *found,
                int brake_first, result *to);
 /* Fallback.keep, and brake; `at` may lack obstacles */
 void judge_inputs(scp_core *core, const step *at, const double *U, scp_status status, result *to);
 void judge_braking(scp_core *core, const step *at, scp_status status, result *to);
+/* Fallback.depths (J, C) of inputs, and the states they lead to; whether these are lost */
+int depths_of(scp_core *core, const step *at, const double *U, double *X, double *deep);
 size_t scratch_of_fallback(const scp_core *core);
 void lay_out_backup(scp_core *core, arena *from);
 void set_up_backup(scp_core *core);
