@@ -267,28 +267,31 @@ void with_pairs(scp_core *core, const nominal *plan, const uint8_t *near, nomina
 
 /* ---- who is relaxed */
 
-int relaxed_bounds(const scp_core *core, relaxation level, const double **lower,
-                   const double **upper)
+int relaxed_bounds(scp_core *core, relaxation level, const double **lower, const double **upper)
 {
     int braked = level != RELAX_NONE && core->at.nb > 0;
+    if (braked)
+        brake_bounds(core);
     *lower = braked ? core->braked_lower : core->strict_lower;
     *upper = braked ? core->braked_upper : core->strict_upper;
     return *lower != core->lower || *upper != core->upper;
 }
 
-static int states_yield(const scp_core *core)
+static int states_yield(scp_core *core)
 {
     const layout *at = &core->at;
     for (int i = 0; i < at->nb; i++)
         if (core->p.row_soft[i])
             return 1;
+    const double *lower, *upper;
     size_t rows = (size_t)(at->ny - at->z) * sizeof(double);
-    return memcmp(core->strict_lower + at->z, core->braked_lower + at->z, rows) != 0 ||
-           memcmp(core->strict_upper + at->z, core->braked_upper + at->z, rows) != 0;
+    relaxed_bounds(core, RELAX_STATES, &lower, &upper);
+    return memcmp(core->strict_lower + at->z, lower + at->z, rows) != 0 ||
+           memcmp(core->strict_upper + at->z, upper + at->z, rows) != 0;
 }
 
 /* Let whoever is next give way; 0 if nobody is left: hard obstacles never do. */
-int relaxes(const scp_core *core, relaxation *level, int hard)
+int relaxes(scp_core *core, relaxation *level, int hard)
 {
     if (*level == RELAX_NONE && states_yield(core)) {
         *level = RELAX_STATES;
@@ -325,7 +328,7 @@ void lay_out_program(const scp_core *core, arena *from, program *p)
         p->W = doubles(from, (size_t)(at->nv * at->nv));
 }
 
-static void write_bounds(const scp_core *core, const condensed *c, const double *radius, program *to)
+static void write_bounds(scp_core *core, const condensed *c, const double *radius, program *to)
 {
     const layout *at = &core->at;
     const double *lower, *upper, *free = c->y_free + at->boxed, *u = c->about->u;
@@ -356,24 +359,24 @@ static void write_weights(const scp_core *core, program *to)
 
 /* The values of the convex program about a plan, whose pairs it holds.
  *
- * c: the problem condensed about it. about_y: half-spaces of its pairs. radius: (N nu,) by how much
+ * c: the problem condensed about it. spaces: half-spaces of its pairs. radius: (N nu,) by how much
  * inputs may change at most, or NULL. */
-void write_program(scp_core *core, const nominal *about, const condensed *c, const planes *about_y,
+void write_program(scp_core *core, const nominal *about, const condensed *c, const planes *spaces,
                    relaxation level, const double *radius, program *to)
 {
     const layout *at = &core->at;
     int d = at->d;
     to->c = *c;
     to->about = about;
-    to->planes = *about_y;
+    to->planes = *spaces;
     to->level = level;
     to->bent = 0;
     for (int k = 0; k < about->pairs.count; k++) {
-        const double *a = about_y->a + k * (d + 1);
+        const double *a = spaces->a + k * (d + 1);
         int p = at->p + about->pairs.node[k] * d, s = at->s + about->pairs.obstacle[k];
-        double b = a[d] * (about_y->y[s] - c->y_free[s]) - about_y->g[k];
+        double b = a[d] * (spaces->y[s] - c->y_free[s]) - spaces->g[k];
         for (int i = 0; i < d; i++)
-            b += a[i] * (about_y->y[p + i] - c->y_free[p + i]);
+            b += a[i] * (spaces->y[p + i] - c->y_free[p + i]);
         to->b[k] = b;
         to->at[2 * k] = p;
         to->at[2 * k + 1] = at->moving ? s : -1;
@@ -381,7 +384,7 @@ void write_program(scp_core *core, const nominal *about, const condensed *c, con
     qp values = {
         .nv = at->nv, .nf = at->nf, .pairs = about->pairs.count, .d = d, .n = at->n,
         .F = c->by->S + at->boxed * at->nv, .lower = to->lower, .upper = to->upper,
-        .a = about_y->a, .S = c->by->S, .at = to->at, .b = to->b, .least = c->least,
+        .a = spaces->a, .S = c->by->S, .at = to->at, .b = to->b, .least = c->least,
     };
     to->qp = values;
     write_bounds(core, c, radius, to);
