@@ -102,7 +102,8 @@ class Settings:
     Attributes:
         tolerance: KKT residual of the original problem at which a plan is certified.
         max_iterations: SCP iterations of one run of the loop at most; each solves one program.
-        solver: Who solves the programs: "osqp", "piqp", or any solver of qpsolvers by its name.
+        solver: Who solves the programs: "osqp", "piqp", or any solver of qpsolvers by its name. Or
+            "native": the whole step is made by the core in C, if that was compiled.
         multi_start: Where an obstacle shapes the plan, try other candidates, too: its other sides,
             other times.
         multi_start_interval: Control steps between two such attempts while it keeps shaping the
@@ -115,8 +116,8 @@ class Settings:
         max_programs: Programs that one step may solve or rank, all runs and candidates together:
             the worst case, also without a deadline.
         max_replayed: Steps in a row that may live on an old plan before the robot brakes.
-        history: Whether plans keep what happened in each SCP iteration.
-        qp: OSQP's settings.
+        history: Whether plans keep what happened in each SCP iteration; the native core does not.
+        qp: OSQP's settings; the native core has no use for them.
         staleness: How old predictions may be; for the controller `MPC` alone.
     """
 

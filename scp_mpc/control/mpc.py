@@ -55,7 +55,7 @@ class MPC:
         self, problem: Problem, settings: Settings | None = None, timer: Timer | None = None
     ) -> None:
         """Set up the solver; there is no plan yet."""
-        self._solver = SCP(problem, settings, timer)
+        self._solver = SCP(problem, settings, timer, problem.model.dt)
         self._deadline = self.settings.time_limit(self.problem.model.dt)
         self._memory = ObstacleMemory(self.settings.staleness, problem.model.dt)
         self._backups = Backup(self.problem, self.settings.tolerance)
@@ -139,7 +139,7 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
-        clock = self._solver.timed(self._deadline)
+        clock = self._solver.clock()
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)

@@ -1,5 +1,6 @@
 """A problem and settings in the numbers of `scp_problem`, for the binding and for the export."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from scp_mpc.settings import Settings
 
 # Room for the shapes of one obstacle: more of anything, and the core is set up again.
 CORNERS, FACES, EDGES = 16, 16, 24
+# Those of control/backup.py.
+BACKUP_SECONDS = 4.0
+BACKUP_SPEEDS = 2.0 ** np.arange(-3, 5)
 
 
 def constants(
@@ -30,7 +34,7 @@ def constants(
     model, margin, size = problem.model, problem.margin, problem.size
     M, count = problem.max_obstacles, problem.nodes_per_interval * len(problem.discs)
     velocity = () if model.velocity is None else model.velocity
-    low, high = problem.row_bounds
+    (low, high), here = problem.row_bounds, np.zeros(model.dim)
     values: dict[str, Any] = {
         "version": VERSION,
         "horizon": problem.horizon,
@@ -49,6 +53,7 @@ def constants(
         "R": problem.R,
         "Qf": problem.Qf,
         "rest": model.equilibrium_input,
+        "moving": np.stack([model.state(here, v * np.eye(model.dim)[0]) for v in BACKUP_SPEEDS]),
         "u_min": problem.u_min,
         "u_max": problem.u_max,
         "limits_rates": int(problem.limits_rates),
@@ -83,7 +88,9 @@ def constants(
         "deadline": deadline or 0.0,
     }
     if not isinstance(margin, Margin):
-        values["sizes"] = np.array([problem.size_for(j, count) for j in range(M + 1)])
+        long = max(problem.horizon, int(np.ceil(BACKUP_SECONDS / model.dt)))
+        for name, owner in ("sizes", problem), ("backup_sizes", replace(problem, horizon=long)):
+            values[name] = np.array([owner.size_for(j, count) for j in range(M + 1)])
     if isinstance(margin, JointRisk) and margin.allocation == "iterative":
         values["joint_risk"] = margin.delta
     return values | _robot(model, problem)

@@ -37,6 +37,7 @@ from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 
 _ALIGNED = 64  # bytes
+_PARTS = ("corners", "vertices"), ("faces", "normals"), ("edges", "edges")  # of a `Solid`
 
 
 @dataclass(frozen=True)
@@ -75,21 +76,25 @@ class Outcome:
     """What a step of the core came to, copied out of it.
 
     Attributes:
-        outputs: The members of `scp_outputs`; its pointers lead nowhere.
-        plan: Numbers of its plan, by `layout`.
-        obstacle_free: Likewise; None where there is none.
-        layout: Where which array is in each of them.
+        raw: The struct `scp_outputs`.
+        numbers: Those of the iterates in it, by name.
+        layouts: Where in them is what.
     """
 
     raw: bytes
-    plan: FloatArray
-    obstacle_free: FloatArray | None
-    layout: tuple[IterateLayout, IterateLayout]
+    numbers: dict[str, FloatArray]
+    layouts: dict[str, IterateLayout]
 
     @property
     def outputs(self) -> Outputs:
-        """See above."""
+        """The struct; its pointers lead nowhere."""
         return Outputs.from_buffer_copy(self.raw)
+
+    def iterate(self, which: str) -> tuple[bool, dict[str, FloatArray]]:
+        """Whether an iterate has multipliers, and its arrays by name."""
+        numbers, layout = self.numbers[which], self.layouts[which]
+        has = bool(getattr(self.outputs, which).has_multipliers)
+        return has, {name: layout.part(numbers, name) for name in layout.places}
 
 
 class NativeCore:
@@ -100,13 +105,13 @@ class NativeCore:
         settings: How to solve it.
         deadline: Of a step [s]; None for none.
         timer: Tells the time [s] to deadlines; None for the machine's clock.
+        room: Shapes of obstacles for which there has to be room, if they are large.
 
     Attributes:
-        inputs: The struct of a step's inputs; its arrays are in `views`.
+        inputs: The struct of a step's inputs.
+        views: Its arrays by name, to be written into.
         outputs: The struct of what came out.
-        views: The arrays of the inputs by name, to be written into.
-        guess: The arrays of the plan to start from, by name; `guess_free` those of the plan that
-            ignores the obstacles.
+        bytes: How large it is.
 
     Raises:
         MissingCoreError: There is no library.
@@ -119,11 +124,16 @@ class NativeCore:
         settings: Settings,
         deadline: float | None = None,
         timer: Timer | None = None,
+        room: Sequence[Solid | None] = (),
     ) -> None:
         """Hand the numbers over and lay everything out."""
         self._call = library()
         self._error: BaseException | None = None
         values = constants(problem, settings, deadline)
+        for solid in filter(None, room):
+            for name, part in _PARTS:
+                most = values[f"max_{name}"]
+                values[f"max_{name}"] = max(most, len(getattr(solid, part)))
         struct, self._kept = _filled(values)
         if values["model"] == OWN_MODEL:
             self._bind(struct, problem.model)
@@ -153,7 +163,7 @@ class NativeCore:
         self.inputs = self._call.scp_in(self._core).contents
         self.outputs = self._call.scp_out(self._core).contents
         self._at_outputs = ctypes.addressof(self.outputs)
-        self._parts = {
+        shapes: dict[str, tuple[int, ...]] = {
             "x0": (model.nx,),
             "x_ref": (N + 1, model.nx),
             "u_last": (model.nu,),
@@ -161,16 +171,14 @@ class NativeCore:
             "covariances": (M, N + 1, d, d),
             "radii": (M,),
             "shape": (M,),
-            "corners": (P,),
-            "faces": (P,),
-            "edges": (P,),
+            **dict.fromkeys(("corners", "faces", "edges"), (P,)),
             "corner": (P, V, d),
             "normal": (P, F, d),
             "offset": (P, F),
             "edge": (P, E, 2),
             "robot_covariance": (N + 1, d, d),
         }
-        self.views = {name: _view(self.inputs, name, s) for name, s in self._parts.items()}
+        self.views = {name: _view(self.inputs, name, shape) for name, shape in shapes.items()}
         iterate: dict[str, tuple[int, ...]] = {
             "states": (N + 1, model.nx),
             "inputs": (N, model.nu),
@@ -184,50 +192,54 @@ class NativeCore:
             "state_bounds": (N, nb),
             "rates": (N, model.nu),
         }
-        self._guesses = [
-            call(self._core).contents for call in (self._call.scp_guess, self._call.scp_guess_free)
-        ]
-        self.guess, self.guess_free = (
+        calls = self._call.scp_guess, self._call.scp_guess_free
+        self._guesses = [call(self._core).contents for call in calls]
+        self._guess_views = [
             {name: _view(struct, name, shape) for name, shape in iterate.items()}
             for struct in self._guesses
-        )
-        self._layout = (
-            IterateLayout.of(self.outputs.plan, iterate),
-            IterateLayout.of(self.outputs.obstacle_free, iterate),
-        )
-        self._plans = [_numbers(layout.address, layout.size) for layout in self._layout]
+        ]
+        self._layouts = {
+            name: IterateLayout.of(getattr(self.outputs, name), iterate)
+            for name in ("plan", "obstacle_free")
+        }
+        self._numbers = {
+            name: _numbers(layout.address, layout.size) for name, layout in self._layouts.items()
+        }
+        self._room = {"corners": V, "faces": F, "edges": E}
         self._solids: list[Solid] = []
 
+    def guess(self, which: int, has_multipliers: bool) -> dict[str, NDArray[Any]]:
+        """Arrays by name to write where to start from: 0 the plan, 1 the obstacle-free one."""
+        self._guesses[which].has_multipliers = has_multipliers
+        return self._guess_views[which]
+
+    def has_room(self, shapes: Sequence[Solid | None]) -> bool:
+        """Whether these shapes of obstacles fit in."""
+        solids = [solid for solid in shapes if solid is not None]
+        return all(len(getattr(s, part)) <= self._room[n] for n, part in _PARTS for s in solids)
+
     def set_shapes(self, shapes: Sequence[Solid | None]) -> None:
-        """Say which obstacles are polytopes, and write those that are new.
-
-        Raises:
-            InvalidArgumentError: One has more corners, faces or edges than there is room for.
-        """
-        number = {id(solid): k for k, solid in enumerate(self._solids)}
+        """Say which obstacles are polytopes, and write them if any is new."""
         solids = list({id(s): s for s in shapes if s is not None}.values())
-        if not all(id(solid) in number for solid in solids):
-            self._write(solids)
+        number = {id(solid): k for k, solid in enumerate(self._solids)}
+        if any(id(solid) not in number for solid in solids):
+            self._solids = solids
             number = {id(solid): k for k, solid in enumerate(solids)}
-        for j, solid in enumerate(shapes):
-            self.views["shape"][j] = -1 if solid is None else number[id(solid)]
+            for k, solid in enumerate(solids):
+                self._write(k, solid)
+        self.inputs.shapes = len(self._solids)
+        self.views["shape"][: len(shapes)] = [-1 if s is None else number[id(s)] for s in shapes]
 
-    def _write(self, solids: list[Solid]) -> None:
-        self._solids = []
-        parts = ("corner", "vertices"), ("face", "normals"), ("edge", "edges")
-        for k, solid in enumerate(solids):
-            for what, name in parts:
-                count = len(getattr(solid, name))
-                most = self.views["normal" if what == "face" else what].shape[1]
-                if count > most:
-                    raise InvalidArgumentError("shape", f"{count} {what}s, room for {most}")
-                self.views[what + "s"][k] = count
-            self.views["corner"][k, : len(solid.vertices)] = solid.vertices
-            self.views["normal"][k, : len(solid.normals)] = solid.normals
-            self.views["offset"][k, : len(solid.offsets)] = solid.offsets
-            self.views["edge"][k, : len(solid.edges)] = solid.edges
-        self._solids = solids
-        self.inputs.shapes = len(solids)
+    def _write(self, k: int, solid: Solid) -> None:
+        for name, part in _PARTS:
+            self.views[name][k] = len(getattr(solid, part))
+        for name, values in (
+            ("corner", solid.vertices),
+            ("normal", solid.normals),
+            ("offset", solid.offsets),
+            ("edge", solid.edges),
+        ):
+            self.views[name][k, : len(values)] = values
 
     def solve(self, guesses: int, multi_start: bool, brake_first: bool) -> str | None:
         """Solve one step; return the name of an input that is refused, None if none is.
@@ -248,16 +260,13 @@ class NativeCore:
         """Forget the steps before."""
         self._call.scp_reset(self._core)
 
-    def has_multipliers(self, *known: bool) -> None:
-        """Say whether `guess` and `guess_free` have multipliers."""
-        for struct, has in zip(self._guesses, known, strict=False):
-            struct.has_multipliers = has
-
     def outcome(self) -> Outcome:
         """Copy what came out."""
-        free = self._plans[1].copy() if self.outputs.has_obstacle_free else None
+        numbers = {"plan": self._numbers["plan"].copy()}
+        if self.outputs.has_obstacle_free:
+            numbers["obstacle_free"] = self._numbers["obstacle_free"].copy()
         raw = ctypes.string_at(self._at_outputs, ctypes.sizeof(Outputs))
-        return Outcome(raw, self._plans[0].copy(), free, self._layout)
+        return Outcome(raw, numbers, self._layouts)
 
     def _done(self, wrong: int) -> str | None:
         self._raise()

@@ -214,4 +214,4 @@ def require_solver(name: object) -> None:
         raise InvalidArgumentError(
             "solver", f"{name!r} is not installed: pip install 'qpsolvers[{name}]'"
         )
-    raise InvalidArgumentError("solver", f"{name!r} is none of {', '.join(there)}")
+    raise InvalidArgumentError("solver", f"{name!r} is none of {', '.join([*there, 'native'])}")

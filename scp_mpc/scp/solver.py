@@ -18,8 +18,9 @@ moves otherwise is sought again, with what it does for the assumption.
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +47,9 @@ from scp_mpc.scp.transcription import Relaxation, Transcription
 from scp_mpc.settings import Settings
 from scp_mpc.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from scp_mpc.scp.native import NativeEngine
+
 _log = logging.getLogger(__name__)
 
 _CORRECTIONS = 4  # of what was assumed about the motion between nodes
@@ -62,32 +66,56 @@ class SCP:
         problem: What to solve.
         settings: How to solve it.
         timer: Tells the time [s] to deadlines; None for the machine's clock.
+        dt: Interval [s] of the loop that it works in, which is the deadline "dt"; None for none.
 
     Raises:
         InvalidArgumentError: There is no solver of that name, or it is not installed.
+        MissingCoreError: The native core is asked for, and not there.
     """
 
     def __init__(
-        self, problem: Problem, settings: Settings | None = None, timer: Timer | None = None
+        self,
+        problem: Problem,
+        settings: Settings | None = None,
+        timer: Timer | None = None,
+        dt: float | None = None,
     ) -> None:
         """Condense the problem, lay the programs out and set the solvers up."""
         self.problem = problem
         self.settings = Settings() if settings is None else settings
         if not isinstance(self.settings, Settings):
             raise InvalidArgumentError("settings", f"{settings!r} is not a Settings")
-        self._busy, self._pace, self._timer = Lock(), Pace(), timer
+        self._busy, self._pace, self._timer, self._dt = Lock(), Pace(), timer, dt
         self._nodes = Nodes.of(problem)
-        self._at = Transcription(problem, self.settings, self._nodes)
-        self._loop = Loop(self._at)
-        self._multi_start = MultiStart(self._at, self._loop)
         self._fallback = Fallback(problem, self.settings.tolerance)
         self._between = problem.nodes_per_interval > 1
+        self._native = self._engine() if self.settings.solver == "native" else None
+        if self._native is None:
+            self._multi_start = MultiStart(self._at, self._loop)
         if self.settings.time_limit() is not None:
             self._warm_up()
 
+    def _engine(self) -> "NativeEngine":
+        from scp_mpc.scp.native import NativeEngine  # when it is asked for, and no sooner
+
+        limit = self.settings.time_limit(self._dt)
+        return NativeEngine(self.problem, self.settings, self._nodes, limit, self._timer)
+
+    @cached_property
+    def _at(self) -> Transcription:
+        """The programs; with the native core only to look at one of them."""
+        native = self.settings.solver == "native"
+        settings = replace(self.settings, solver="osqp") if native else self.settings
+        return Transcription(self.problem, settings, self._nodes)
+
+    @cached_property
+    def _loop(self) -> Loop:
+        return Loop(self._at)
+
     def __getstate__(self) -> dict[str, object]:
         """What a copy is built from: solvers and locks are not copied."""
-        return {"problem": self.problem, "settings": self.settings, "timer": self._timer}
+        parts = {"problem": self.problem, "settings": self.settings}
+        return parts | {"timer": self._timer, "dt": self._dt}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the copy."""
@@ -147,6 +175,11 @@ class SCP:
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
+            if self._native is not None:
+                return self._native.solve(
+                    *(x0, x_ref, obstacles, nominal, multi_start, robot_covariance, u_last),
+                    brake_first,
+                )
             clock = self.clock() if clock is None else clock
             step = Step.read(
                 self.problem, x0, x_ref, obstacles, robot_covariance, self._nodes, u_last
@@ -238,12 +271,9 @@ class SCP:
         return self._plan(step, Found(self._fallback.keep(step, inputs)), Clock())
 
     def clock(self) -> Clock:
-        """The clock of a step that begins now, in no loop."""
-        return self.timed(self.settings.time_limit())
-
-    def timed(self, deadline: float | None) -> Clock:
-        """The clock of a step that begins now and is to end by a deadline [s]."""
-        return Clock(deadline, self._pace, self.settings.max_programs, self._timer)
+        """The clock of a step that begins now."""
+        limit = self.settings.time_limit(self._dt)
+        return Clock(limit, self._pace, self.settings.max_programs, self._timer)
 
     def _warm_up(self) -> None:
         """Solve some steps with everybody in the way: first calls are slow, and paces unknown."""
@@ -421,7 +451,7 @@ class SCP:
         slack = iterate.slack[: step.count]
         if step.nodes.count > 1:
             slack = frozen(step.nodes.stages(slack).max(axis=2, initial=0.0))
-        finished = self._at.hard.solver.finished + self._at.elastic.solver.finished
+        finished = self._at.finished if self._native is None else {}
         return Plan(
             X=iterate.states,
             U=iterate.inputs,

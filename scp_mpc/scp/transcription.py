@@ -114,6 +114,11 @@ class Transcription:
         for subproblem in (self.hard, self.elastic):
             subproblem.solver.finished, subproblem.about = Counter(), None
 
+    @property
+    def finished(self) -> Counter[str]:
+        """Programs of this step by who finished them."""
+        return self.hard.solver.finished + self.elastic.solver.finished
+
     # --- plans
 
     def path(self, y: FloatArray) -> FloatArray:

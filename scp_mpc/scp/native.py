@@ -1,0 +1,278 @@
+"""The native core as a step engine: plans like those of the loop, unpacked when they are asked for.
+
+What a step brings is written into the core's buffers with no more than a look at its shape; the
+core checks every number, and where it refuses one, `Step.read` says which and why.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scp_mpc.arrays import FloatArray, as_array, frozen
+from scp_mpc.deadline import Timer
+from scp_mpc.errors import InvalidArgumentError, TooManyObstaclesError
+from scp_mpc.native.core import NativeCore, Outcome
+from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions, require_fitting
+from scp_mpc.problem import Problem
+from scp_mpc.qp.program import KKTResiduals
+from scp_mpc.scp.iterate import Iterate, Multipliers
+from scp_mpc.scp.nodes import Nodes
+from scp_mpc.scp.plan import Candidate, Plan, Status, Timing
+from scp_mpc.scp.step import Step
+from scp_mpc.settings import Settings
+
+_STATUSES = [status for status in Status if status is not Status.STALE]  # as in `scp_status`
+_DUALS = ("dynamics", "input_bounds", "margin", "obstacles", "pins", "state_bounds", "rates")
+_COUNTS = {"kkt": "kkt", "native": "solved"} | {n: n for n in ("ranked", "cut", "infeasible")}
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a step was given, nobody else's: arguments of `Step.read`."""
+
+    problem: Problem
+    x0: FloatArray
+    x_ref: FloatArray
+    obstacles: Sequence[ObstaclePrediction]
+    robot_covariance: FloatArray | None
+    nodes: Nodes
+    u_last: FloatArray | None
+
+    def read(self) -> Step:
+        """The step."""
+        return Step.read(
+            *(self.problem, self.x0, self.x_ref, self.obstacles),
+            *(self.robot_covariance, self.nodes, self.u_last),
+        )
+
+
+class NativePlan(Plan):
+    """A plan of the core's; its parts are made when they are asked for."""
+
+    _outcome: Outcome
+    _given: Given
+
+    @classmethod
+    def of(cls, core: NativeCore, given: Given, timing: Timing) -> "NativePlan":
+        """The plan of the step that the core has just made."""
+        plan, outputs = object.__new__(cls), core.outputs
+        vars(plan).update(
+            _outcome=core.outcome(),
+            _given=given,
+            timing=timing,
+            status=_STATUSES[outputs.status],
+            cost=outputs.cost,
+            iterations=outputs.iterations,
+            switched=bool(outputs.switched),
+            history=(),
+            left_out=0,
+        )
+        return plan
+
+    def __getattr__(self, name: str) -> Any:
+        """Make a part, once."""
+        if name not in _PARTS or "_outcome" not in vars(self):
+            raise AttributeError(name)
+        part = vars(self)[name] = _PARTS[name](self._outcome, self._given, self)
+        return part
+
+    @cached_property
+    def contact(self) -> tuple[int, ...]:
+        """See `Plan`."""
+        told = vars(self).get("_outcome")
+        return self.step.contact if told is None or told.outputs.contact else ()
+
+
+def _iterate(outcome: Outcome, given: Given, _: Plan) -> Iterate:
+    free = None
+    if outcome.outputs.has_obstacle_free:
+        free = _named(*outcome.iterate("obstacle_free"), given, None)
+    return _named(*outcome.iterate("plan"), given, free)
+
+
+def _named(
+    has_multipliers: bool, part: dict[str, FloatArray], given: Given, free: Iterate | None
+) -> Iterate:
+    """An iterate of the core's arrays."""
+    duals = None
+    if has_multipliers:
+        values = [part[name] for name in _DUALS]
+        if not given.problem.limits_rates:
+            values[-1] = np.zeros((0, 0))
+        duals = Multipliers(*values)
+    primal = part["states"], part["inputs"], part["s"], part["slack"]
+    return Iterate(*primal, duals, free).frozen()
+
+
+def _slack(_: Outcome, given: Given, plan: Plan) -> FloatArray:
+    slack = plan.iterate.slack[: len(given.obstacles)]
+    return frozen(given.nodes.stages(slack).max(axis=2, initial=0.0))
+
+
+def _residuals(outcome: Outcome, *_: Any) -> KKTResiduals:
+    outputs = outcome.outputs
+    three = outputs.stationarity, outputs.feasibility, outputs.complementarity
+    return KKTResiduals(*three, outputs.curvature)
+
+
+def _finished(outcome: Outcome, *_: Any) -> dict[str, int]:
+    outputs = outcome.outputs
+    counts = {name: int(getattr(outputs, member)) for name, member in _COUNTS.items()}
+    return {name: count for name, count in counts.items() if count}
+
+
+def _candidates(outcome: Outcome, given: Given, _: Plan) -> tuple[Candidate, ...]:
+    outputs, d = outcome.outputs, given.problem.model.dim
+    return tuple(
+        Candidate(c.obstacle, frozen(np.array(c.side[:d])), c.time, c.merit)
+        for c in outputs.candidate[: outputs.candidates]
+    )
+
+
+def _step(_: Outcome, given: Given, plan: Plan) -> Step:
+    """The step, its radii as the plan's own motion between the nodes asks for."""
+    step, nodes = given.read(), given.nodes
+    if step.count and nodes.instants > 1:
+        step = step.widened(nodes.radii(step.radii, step.drift, nodes.motion(plan.X, plan.U)))
+    return step
+
+
+_PARTS: dict[str, Callable[[Outcome, Given, Plan], Any]] = {
+    "iterate": _iterate,
+    "X": lambda _, __, plan: plan.iterate.states,
+    "U": lambda _, __, plan: plan.iterate.inputs,
+    "s": lambda _, given, plan: plan.iterate.s[: len(given.obstacles)],
+    "slack": _slack,
+    "x_slack": lambda _, given, plan: frozen(given.problem.excess(plan.X)),
+    "kkt": _residuals,
+    "qps": _finished,
+    "candidates": _candidates,
+    "step": _step,
+}
+
+
+class NativeEngine:
+    """Makes the plans of control steps with the native core.
+
+    Args:
+        problem: What to solve.
+        settings: How to solve it.
+        nodes: Where plans are constrained.
+        deadline: Of a step [s]; None for none.
+        timer: Tells the time [s] to deadlines; None for the machine's clock.
+
+    Raises:
+        MissingCoreError: There is no native core.
+        InvalidArgumentError: `Settings(history=True)`: the core keeps none.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: Settings,
+        nodes: Nodes,
+        deadline: float | None,
+        timer: Timer | None,
+    ) -> None:
+        """Lay the core out."""
+        if settings.history:
+            raise InvalidArgumentError("history", "is not kept by solver = 'native'")
+        self._problem, self._nodes = problem, nodes
+        self._laid_out = problem, settings, deadline, timer
+        self.core = NativeCore(*self._laid_out)
+
+    def solve(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        nominal: Iterate | None = None,
+        multi_start: bool = True,
+        robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
+        brake_first: bool = False,
+    ) -> Plan:
+        """`SCP.solve_from`."""
+        began = perf_counter()
+        given = self._write(x0, x_ref, obstacles, robot_covariance, u_last)
+        guesses = 0
+        if nominal is not None:
+            nominal = nominal.unwrapped(self._problem.model, given.x0)
+            guesses = self._guess(nominal)
+        wrote = perf_counter()
+        wrong = self.core.solve(guesses, multi_start, brake_first)
+        return self._plan(given, wrong, began, wrote)
+
+    def _plan(self, given: Given, wrong: str | None, began: float, wrote: float) -> Plan:
+        """What the core came to, or the error that it stands for."""
+        solved = perf_counter()
+        if wrong is not None:
+            given.read()
+            raise InvalidArgumentError(wrong, "is refused by the native core")
+        timing = Timing(0.0, wrote - began, solved - wrote, perf_counter() - began)
+        return NativePlan.of(self.core, given, timing)
+
+    def _write(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        robot_covariance: ArrayLike | None,
+        u_last: ArrayLike | None,
+    ) -> Given:
+        """Write a step into the core's buffers."""
+        model, N = self._problem.model, self._problem.horizon
+        inputs, views = self.core.inputs, self.core.views
+        views["x0"][:] = as_array("x0", x0, (model.nx,))
+        reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
+        views["x_ref"][:] = reference
+        inputs.has_u_last = u_last is not None
+        if u_last is not None:
+            views["u_last"][:] = as_array("u_last", u_last, (model.nu,))
+        inputs.has_robot_covariance = robot_covariance is not None
+        uncertain = None
+        if robot_covariance is not None:
+            shape = (model.dim, model.dim)
+            uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
+            views["robot_covariance"][:] = uncertain
+        known = self._write_obstacles(obstacles)
+        u = None if u_last is None else views["u_last"].copy()
+        x = views["x0"].copy(), views["x_ref"].copy()
+        return Given(self._problem, *x, known, uncertain, self._nodes, u)
+
+    def _write_obstacles(
+        self, obstacles: Sequence[ObstaclePrediction]
+    ) -> Sequence[ObstaclePrediction]:
+        problem, views = self._problem, self.core.views
+        M, N = problem.max_obstacles, problem.horizon
+        known = as_predictions(obstacles)
+        if len(known) > M:
+            raise TooManyObstaclesError("obstacles", f"{len(known)} exceed max_obstacles = {M}")
+        require_fitting(known, N, problem.model.dim, problem.model.dt)
+        for j, o in enumerate(known):
+            views["means"][j], views["covariances"][j] = o.means, o.covariances
+            views["radii"][j] = o.radius
+        shapes = [o.shape for o in known]
+        if not self.core.has_room(shapes):
+            self.core = NativeCore(*self._laid_out, room=shapes)
+            return self._write_obstacles(known)
+        self.core.set_shapes(shapes)
+        self.core.inputs.count = len(known)
+        return known
+
+    def _guess(self, nominal: Iterate) -> int:
+        """Write where to start; return how many plans that are."""
+        known = [nominal] if nominal.obstacle_free is None else [nominal, nominal.obstacle_free]
+        for k, plan in enumerate(known):
+            duals, parts = plan.multipliers, self.core.guess(k, plan.multipliers is not None)
+            for name in ("states", "inputs", "s", "slack"):
+                parts[name][:] = getattr(plan, name)
+            if duals is not None:
+                for name, values in zip(_DUALS, vars(duals).values(), strict=True):
+                    parts[name][:] = values if values.size else 0.0
+        return len(known)
