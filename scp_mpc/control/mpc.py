@@ -139,7 +139,7 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
-        clock = self._solver.clock()
+        clock = self._solver.timed(self._deadline)
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)

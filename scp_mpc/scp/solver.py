@@ -272,8 +272,11 @@ class SCP:
 
     def clock(self) -> Clock:
         """The clock of a step that begins now."""
-        limit = self.settings.time_limit(self._dt)
-        return Clock(limit, self._pace, self.settings.max_programs, self._timer)
+        return self.timed(self.settings.time_limit(self._dt))
+
+    def timed(self, deadline: float | None) -> Clock:
+        """The clock of a step that begins now and is to end by a deadline [s]."""
+        return Clock(deadline, self._pace, self.settings.max_programs, self._timer)
 
     def _warm_up(self) -> None:
         """Solve some steps with everybody in the way: first calls are slow, and paces unknown."""
