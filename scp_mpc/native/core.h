@@ -211,12 +211,12 @@ typedef enum { QP_SOLVED, QP_INFEASIBLE, QP_UNSOLVED, QP_CUT } qp_end;
 /* ---- condensing: condensing.py */
 
 /* How outputs answer to v along some derivatives. A Riccati pass gives the coordinates,
- *     v_i = L_i'(du_i + K_i de_i),     H = sum of the L_i L_i' around,
+ *     cost = least + |v|^2 / 2,     u = u_free + T_i' v_i - K_i (e - e_free),
  * so that v_i acts on interval i and later ones only: rows of S are zero beyond their interval. Any
  * rotation of v would do; Python's is another. u = u_free + (rows u of S) v; sizes come last in v. */
 typedef struct {
     double *K;        /* (N, nu, nx) feedback of the plan that nothing constrains */
-    double *L;        /* (N, nu, nu) lower Cholesky factors of 2 R + B'P B */
+    double *T;        /* (N, nu, nu) inverses of lower Cholesky factors of 2 R + B'P B */
     double *E;        /* (N, nx, n) responses of e to v */
     double *S;        /* (ny, nv) */
 } sensitivity;
@@ -369,6 +369,7 @@ void nodes_radii(nodes of, int J, const double *radii, const double *drift, cons
 /* stages (N, nx+nu, nx+nu), sway (N,) or untouched; returns whether there is a sway */
 int nodes_curvature(const scp_core *core, const double *X, const double *U, const double *nu,
                     const double *phi, double *stages, double *sway);
+size_t scratch_of_nodes(const scp_core *core);
 
 /* ---- geometry.c, polytopes.c; geometry/ */
 
@@ -413,10 +414,14 @@ void step_risks(const scp_core *core, const step *at, const double *path, double
 
 /* ---- braking.c; braking.py, problem.py */
 
+static const double AT_REST = 0.05; /* [m/s] at which a robot counts as standing */
+
 int braking(const scp_core *core, int N, const double *x, const double *u_last, double *U,
             double *X); /* steps; U (N, nu), X (N+1, nx) */
 void brake_now(scp_core *core); /* core->braking_*, once a step */
 void resting_input(const scp_core *core, double *u);
+/* What rates allow of the first input after u_last (nu,): infinite where they are not bounded, or
+ * where u_last is NULL, unknown. */
 void reach(const scp_core *core, const double *u_last, double *lower, double *upper);
 void limited(const scp_core *core, int N, double *U, const double *u_last); /* in place */
 int stands(const scp_core *core, const double *X);
