@@ -582,6 +582,7 @@ void set_up_backup(scp_core *core);
 int backup_of(scp_core *core, const double *X, const double *U, double *inputs); /* steps, -1 for none */
 int backup_continued(scp_core *core, const double *x, const double *inputs, int count,
                      double *whole); /* whole (N, nu); 0 if it is not clear any more */
+int backup_horizon(const scp_core *core); /* how many intervals it looks ahead */
 int backup_always(const scp_core *core); /* whether there is one without any obstacle, too */
 size_t scratch_of_backup(const scp_core *core);
 
