@@ -328,9 +328,10 @@ static void lay_out_inputs(scp_core *core, arena *from)
 static size_t scratch_of(const scp_core *core)
 {
     static size_t (*const parts[])(const scp_core *) = {
-        scratch_of_step,   scratch_of_condensing,  scratch_of_transcription, scratch_of_loop,
-        scratch_of_newton, scratch_of_start,       scratch_of_candidates,    scratch_of_multi_start,
-        scratch_of_fallback, scratch_of_backup,    scratch_of_solver,        scratch_of_controller};
+        scratch_of_step,          scratch_of_linalg,     scratch_of_nodes,  scratch_of_condensing,
+        scratch_of_certificate,   scratch_of_loop,       scratch_of_newton, scratch_of_start,
+        scratch_of_transcription, scratch_of_candidates, scratch_of_solver, scratch_of_multi_start,
+        scratch_of_fallback,      scratch_of_backup,     scratch_of_controller};
     size_t sum = 4096; /* and what alignment takes */
     for (size_t k = 0; k < sizeof parts / sizeof *parts; k++)
         sum += parts[k](core) + 1024;
@@ -393,7 +394,6 @@ scp_core *scp_setup(const scp_problem *problem, void *block, size_t size)
     set_up_condensing(core);
     set_up_transcription(core);
     set_up_loop(core);
-    set_up_multi_start(core);
     set_up_backup(core);
     scp_reset(core);
     return core;

@@ -341,6 +341,7 @@ void eigen_small(int d, const double *A, double *values, double *vectors); /* d 
 int eigen(int n, double *A, double *values, double *vectors, arena *scratch);
 /* Smallest eigenvalue of a symmetric (n, n) that is destroyed, and its vector; largest modulus, too. */
 int eigen_least(int n, double *A, double *least, double *most_abs, double *vector, arena *scratch);
+size_t scratch_of_linalg(const scp_core *core);
 
 /* ---- robots: robots.c; models/ */
 
@@ -470,6 +471,7 @@ void track_of(const scp_core *core, const double *e, double *track);
 /* Smallest curvature of I + W - F'F that active constraints leave; W may be NULL. */
 double least_curvature(scp_core *core, int nv, const double *W, int q, const double *factors, int k,
                        const double *rows, const double *force, double *direction);
+size_t scratch_of_certificate(const scp_core *core);
 
 /* ---- active_set.c */
 
@@ -562,8 +564,9 @@ int same_pattern(const scp_core *core, const double *path_a, const uint8_t *touc
                  const double *path_b, const uint8_t *touched_b); /* (C, d), (J, C) */
 void lay_out_multi_start(scp_core *core, arena *from);
 int multi_start_wanted(const scp_core *core, const result *best, int due);
-void set_up_multi_start(scp_core *core);
 size_t scratch_of_multi_start(const scp_core *core);
+void forget_alternatives(scp_core *core); /* those of this step */
+void shift_alternatives(scp_core *core);  /* they are those of the step before now */
 /* `best` is replaced if another one wins; uses the alternatives of the step before. */
 void multi_start(scp_core *core, result *best, const double *free_path, int has_last);
 
