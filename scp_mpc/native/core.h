@@ -316,7 +316,7 @@ struct scp_core {
     int broken;                /* whether a computation broke down in this step */
     workspace *work;
 
-    void *models, *geometry, *condensing, *active, *certify, *loop, *newton, *start, *candidates,
+    void *models, *geometry, *condensing, *active, *certify, *loop, *newton, *multi,
         *fallback, *backup, *solver, *memory, *steps; /* what the parts keep for themselves */
 };
 
