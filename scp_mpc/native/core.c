@@ -408,7 +408,3 @@ const scp_outputs *scp_out(const scp_core *core) { return &core->out; }
 scp_iterate *scp_guess(scp_core *core) { return &core->guess; }
 
 scp_iterate *scp_guess_free(scp_core *core) { return &core->guess_free; }
-
-int is_ok(scp_status status) { return status <= SCP_BRAKING; }
-
-int is_certified(scp_status status) { return status == SCP_CONVERGED || status == SCP_SOFTENED; }
