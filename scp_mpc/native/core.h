@@ -478,7 +478,7 @@ size_t scratch_of_certificate(const scp_core *core);
 void lay_out_active_set(scp_core *core, arena *from);
 void lay_out_solution(const scp_core *core, arena *from, solution *s);
 /* From a guess in s->active and s->relaxed (zeros: none) to the solution, in at most so many
- * changes; cut off once the dual objective exceeds `limit`. `changes` counts systems. */
+ * changes; cut off once the dual objective exceeds `limit`. QP_UNSOLVED: not from this guess. */
 qp_end settle(scp_core *core, const qp *of, solution *s, int most, double limit, int *systems);
 int holds(scp_core *core, const qp *of, const solution *s);
 double qp_merit(scp_core *core, const qp *of, const double *v);
@@ -567,6 +567,7 @@ int multi_start_wanted(const scp_core *core, const result *best, int due);
 size_t scratch_of_multi_start(const scp_core *core);
 void forget_alternatives(scp_core *core); /* those of this step */
 void shift_alternatives(scp_core *core);  /* they are those of the step before now */
+void ignore_alternatives(scp_core *core); /* nothing is known of the step before */
 /* `best` is replaced if another one wins; uses the alternatives of the step before. */
 void multi_start(scp_core *core, result *best, const double *free_path, int has_last);
 
@@ -597,6 +598,7 @@ void lay_out_controller(scp_core *core, arena *from);
 size_t scratch_of_controller(const scp_core *core);
 void solve_step(scp_core *core, const scp_iterate *last, const scp_iterate *last_free, int multi,
                 int brake_first);
+void hand_out(scp_core *core, const result *best); /* becomes the plan of the step */
 void shift_iterate(const scp_core *core, scp_iterate *it); /* in place: one step later */
 
 void begin_clock(scp_core *core);
