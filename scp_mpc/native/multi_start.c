@@ -135,6 +135,12 @@ void forget_alternatives(scp_core *core)
     room->made.count = 0;
 }
 
+void ignore_alternatives(scp_core *core)
+{
+    multi_room *room = core->multi;
+    room->known.count = 0;
+}
+
 /* What this step has found out is known in the next one, shifted by one stage. */
 void shift_alternatives(scp_core *core)
 {
