@@ -47,6 +47,7 @@ from scp_mpc.obstacles import (
     CircularObstacle,
     ConstantVelocityPredictor,
     ObstaclePrediction,
+    ObstaclePredictions,
     Polytope,
     ReportPredictor,
 )
@@ -87,6 +88,7 @@ __all__ = [
     "Model",
     "NotFiniteError",
     "ObstaclePrediction",
+    "ObstaclePredictions",
     "Path",
     "PathReference",
     "Plan",

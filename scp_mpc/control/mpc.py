@@ -76,7 +76,7 @@ class MPC:
         self._applied: FloatArray | None = None
         self._backup: FloatArray | None = None
         self._steps_touching = self._steps_standing = 0
-        self._obstacles: tuple[ObstaclePrediction, ...] = ()
+        self._obstacles: Sequence[ObstaclePrediction] = ()
         self._counts.clear()
         self.overruns = self.replayed = self._left_out = 0
         self._memory.reset()
@@ -102,7 +102,7 @@ class MPC:
 
         `plan.s` and `plan.slack` are in this order.
         """
-        return self._obstacles
+        return tuple(self._obstacles)
 
     def nominal(self) -> Iterate | None:
         """The guess from which the next step starts; None before the first step."""
@@ -190,7 +190,7 @@ class MPC:
         self,
         x0: ArrayLike,
         x_ref: ArrayLike,
-        obstacles: tuple[ObstaclePrediction, ...],
+        obstacles: Sequence[ObstaclePrediction],
         last: FloatArray | None,
     ) -> tuple[ObstaclePrediction, ...]:
         """As many as there are slots for: nearest to the nominal plan and to the last backup."""
@@ -246,7 +246,7 @@ class MPC:
         plan: Plan,
         x0: ArrayLike,
         x_ref: ArrayLike,
-        obstacles: tuple[ObstaclePrediction, ...],
+        obstacles: Sequence[ObstaclePrediction],
         robot_covariance: ArrayLike | None,
         last: FloatArray | None,
     ) -> tuple[Plan, FloatArray | None]:

@@ -3,14 +3,15 @@
 Nothing here changes before `commit`: a step that fails in between leaves no trace.
 """
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from scp_mpc.arrays import as_number
 from scp_mpc.errors import InvalidArgumentError, StaleDataError
-from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.predictions import ObstaclePredictions, as_predictions
 from scp_mpc.obstacles.propagation import propagated
 from scp_mpc.settings import StalenessPolicy
 
@@ -37,7 +38,7 @@ class Recall(NamedTuple):
     Attributes:
         time: Of this step [s].
         obstacles: The predictions as of now: those given, in their order, then those kept. Just
-            those given, as they are, where one of them is too old.
+            those given, as they are, where one of them is too old, or nothing is to be done.
         stale: Which one is too old to plan with; None if none is.
         reports: What to remember.
         timed: Whether this step or one before was given its time.
@@ -45,7 +46,7 @@ class Recall(NamedTuple):
     """
 
     time: float
-    obstacles: tuple[ObstaclePrediction, ...]
+    obstacles: Sequence[ObstaclePrediction]
     stale: StaleDataError | None
     reports: Mapping[Hashable, Report]
     timed: bool
@@ -99,12 +100,16 @@ class ObstacleMemory:
         given = as_predictions(obstacles)
         required = self._staleness.stamps == "required"
         now = self._now(time, required)
-        stamps = [o.stamp for o in given if o.stamp is not None]
+        if isinstance(given, ObstaclePredictions):
+            stamps = [] if given.stamp is None else [given.stamp]
+            plain = given.stamp is None and given.names is None
+        else:
+            stamps = [o.stamp for o in given if o.stamp is not None]
+            plain = all(o.stamp is None and o.name is None for o in given)
         newest = max(stamps, default=self._newest)
         if time is None and stamps:
             self._require_own_clock(now, max(stamps))
         clock = self._timed or time is not None, newest
-        plain = all(o.stamp is None and o.name is None for o in given)
         if plain and not self._reports and not (required and given):
             return Recall(now, given, None, _NOTHING, *clock)
         since = [self._since(j, o, now, required) for j, o in enumerate(given)]
@@ -192,7 +197,7 @@ class ObstacleMemory:
         return propagated(prediction, age, self._dt, self._staleness.growth)
 
     def _stale(
-        self, given: tuple[ObstaclePrediction, ...], since: list[float], now: float
+        self, given: Sequence[ObstaclePrediction], since: list[float], now: float
     ) -> StaleDataError | None:
         limit = self._staleness.stop_after
         j = min(range(len(given)), key=since.__getitem__, default=None)
@@ -204,7 +209,7 @@ class ObstacleMemory:
         )
 
 
-def _require_distinct(given: tuple[ObstaclePrediction, ...], names: int) -> None:
+def _require_distinct(given: Sequence[ObstaclePrediction], names: int) -> None:
     """Raise for the first name that is given twice."""
     named = [(j, o.name) for j, o in enumerate(given) if o.name is not None]
     if len(named) == names:

@@ -21,7 +21,8 @@ from scp_mpc.arrays import BoolArray, FloatArray, IntArray, as_array, as_number
 from scp_mpc.control.path import Path
 from scp_mpc.errors import BoundsError, ShapeError
 from scp_mpc.geometry.no_go import NoGoSets
-from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.predictions import as_predictions
 from scp_mpc.problem import Problem
 from scp_mpc.settings import require_positive
 

@@ -3,6 +3,7 @@
 from scp_mpc.obstacles.circular import CircularObstacle
 from scp_mpc.obstacles.polytope import Polytope
 from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.predictions import ObstaclePredictions
 from scp_mpc.obstacles.predictors import ConstantVelocityPredictor, Predictor, ReportPredictor
 from scp_mpc.obstacles.propagation import propagated
 
@@ -10,6 +11,7 @@ __all__ = [
     "CircularObstacle",
     "ConstantVelocityPredictor",
     "ObstaclePrediction",
+    "ObstaclePredictions",
     "Polytope",
     "Predictor",
     "ReportPredictor",

@@ -1,6 +1,6 @@
 """What the controller is told about one moving obstacle."""
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -90,15 +90,15 @@ class ObstaclePrediction:
         if stamp is not None:
             stamp = as_number("stamp", stamp)
         if name is not None:
-            _require_hashable(name)
+            require_hashable("name", name)
         if shape is not None:
-            _require_solid(shape, dim)
-            _require_own_frame(shape, mu[0])
+            require_solid("shape", shape, dim)
+            require_own_frame("shape", shape, mu[0])
         if dt is not None:
             dt = as_number("dt", dt)
             if dt <= 0:
                 raise BoundsError("dt", f"{dt} s is not positive")
-        self._set(mu, Sigma, radius, stamp, name, shape, dt, _deviations(variances))
+        self._set(mu, Sigma, radius, stamp, name, shape, dt, deviations(variances))
 
     @classmethod
     def static(
@@ -130,7 +130,7 @@ class ObstaclePrediction:
     ) -> "ObstaclePrediction":
         """Return the same obstacle elsewhere, unchecked: for what follows from checked arrays."""
         other = object.__new__(ObstaclePrediction)
-        largest_std = _deviations(np.linalg.eigvalsh(covariances))
+        largest_std = deviations(np.linalg.eigvalsh(covariances))
         kept = self.radius, stamp, self.name, self.shape, self.dt
         other._set(means, covariances, *kept, largest_std)
         return other
@@ -203,7 +203,7 @@ class ObstaclePrediction:
         return int(self.means.shape[1])
 
 
-def _deviations(variances: NDArray[np.floating]) -> FloatArray:
+def deviations(variances: NDArray[np.floating]) -> FloatArray:
     """Roots (...) of the largest eigenvalues of covariances, given all (..., d), ascending."""
     return np.sqrt(np.maximum(variances[..., -1], 0.0))
 
@@ -217,21 +217,23 @@ def positive_part(matrix: FloatArray) -> FloatArray:
     return (part + part.T) / 2
 
 
-def _require_hashable(name: object) -> None:
+def require_hashable(argument: str, name: object) -> None:
+    """Raise unless a name can be one."""
     try:
         hash(name)
     except TypeError:
-        raise InvalidArgumentError("name", f"{name!r} is not hashable") from None
+        raise InvalidArgumentError(argument, f"{name!r} is not hashable") from None
 
 
-def _require_solid(shape: object, dim: int) -> None:
+def require_solid(argument: str, shape: object, dim: int) -> None:
+    """Raise unless it is a body in so many dimensions."""
     if not isinstance(shape, Solid):
-        raise InvalidArgumentError("shape", f"{shape!r} is not a Polytope")
+        raise InvalidArgumentError(argument, f"{shape!r} is not a Polytope")
     if shape.dim != dim:
-        raise ShapeError("shape", f"{shape.dim}-dimensional, but the means are {dim}-dimensional")
+        raise ShapeError(argument, f"{shape.dim}-dimensional, but the means are {dim}-dimensional")
 
 
-def _require_own_frame(shape: Solid, mean: FloatArray) -> None:
+def require_own_frame(argument: str, shape: Solid, mean: FloatArray) -> None:
     """Raise if a body's corners are around its mean: then they would be offset by it once more.
 
     A frame's origin may be outside of the body, and the obstacle may pass where its corners are in
@@ -246,7 +248,7 @@ def _require_own_frame(shape: Solid, mean: FloatArray) -> None:
     if (within and outside > size) or (centred and outside > 0):
         offset = float(np.linalg.norm(mean))
         raise GeometryError(
-            "shape",
+            argument,
             f"its corners are around the mean {mean.tolist()}: offset by {offset:.3g} m twice. "
             "Corners are relative to the mean",
         )
@@ -270,29 +272,12 @@ def unchecked_predictions(
         names: n of them.
         dt: Interval between rows [s].
     """
-    largest_stds = _deviations(np.linalg.eigvalsh(covariances))
+    largest_stds = deviations(np.linalg.eigvalsh(covariances))
     made = []
     for mu, Sigma, largest_std, name in zip(means, covariances, largest_stds, names, strict=True):
         made.append(object.__new__(ObstaclePrediction))
         made[-1]._set(mu, Sigma, radius, stamp, name, None, dt, largest_std)
     return made
-
-
-def as_predictions(obstacles: object) -> tuple[ObstaclePrediction, ...]:
-    """Return any iterable of predictions as a tuple.
-
-    Raises:
-        InvalidArgumentError: It is none, or holds something else.
-    """
-    if isinstance(obstacles, ObstaclePrediction) or not isinstance(obstacles, Iterable):
-        raise InvalidArgumentError("obstacles", f"{obstacles!r} is not a list of predictions")
-    given = tuple(obstacles)
-    for j, obstacle in enumerate(given):
-        if not isinstance(obstacle, ObstaclePrediction):
-            raise InvalidArgumentError(
-                f"obstacles[{j}]", f"{obstacle!r} is not an ObstaclePrediction"
-            )
-    return given
 
 
 def require_fitting(

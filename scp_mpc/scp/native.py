@@ -17,7 +17,8 @@ from scp_mpc.arrays import FloatArray, as_array, frozen
 from scp_mpc.deadline import Timer
 from scp_mpc.errors import InvalidArgumentError, TooManyObstaclesError
 from scp_mpc.native.core import NativeCore, Outcome
-from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions, require_fitting
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.predictions import ObstaclePredictions, as_predictions
 from scp_mpc.problem import Problem
 from scp_mpc.qp.program import KKTResiduals
 from scp_mpc.scp.iterate import Iterate, Multipliers
@@ -38,7 +39,7 @@ class Given:
     problem: Problem
     x0: FloatArray
     x_ref: FloatArray
-    obstacles: Sequence[ObstaclePrediction]
+    obstacles: ObstaclePredictions
     robot_covariance: FloatArray | None
     nodes: Nodes
     u_last: FloatArray | None
@@ -245,25 +246,24 @@ class NativeEngine:
         x = views["x0"].copy(), views["x_ref"].copy()
         return Given(self._problem, *x, known, uncertain, self._nodes, u)
 
-    def _write_obstacles(
-        self, obstacles: Sequence[ObstaclePrediction]
-    ) -> Sequence[ObstaclePrediction]:
+    def _write_obstacles(self, obstacles: Sequence[ObstaclePrediction]) -> ObstaclePredictions:
         problem, views = self._problem, self.core.views
-        M, N = problem.max_obstacles, problem.horizon
+        M = problem.max_obstacles
         known = as_predictions(obstacles)
         if len(known) > M:
             raise TooManyObstaclesError("obstacles", f"{len(known)} exceed max_obstacles = {M}")
-        require_fitting(known, N, problem.model.dim, problem.model.dt)
-        for j, o in enumerate(known):
-            views["means"][j], views["covariances"][j] = o.means, o.covariances
-            views["radii"][j] = o.radius
-        shapes = [o.shape for o in known]
-        if not self.core.has_room(shapes):
+        model, J = problem.model, len(known)
+        stacked = ObstaclePredictions.of(known, problem.horizon, model.dim, model.dt)
+        shapes = stacked.shapes
+        if shapes is not None and not self.core.has_room(shapes):
             self.core = NativeCore(*self._laid_out, room=shapes)
-            return self._write_obstacles(known)
-        self.core.set_shapes(shapes)
-        self.core.inputs.count = len(known)
-        return known
+            views = self.core.views
+        views["means"][:J] = stacked.means
+        views["covariances"][:J] = stacked.covariances
+        views["radii"][:J] = stacked.radii
+        self.core.set_shapes(shapes or (None,) * J)
+        self.core.inputs.count = J
+        return stacked
 
     def _guess(self, nominal: Iterate) -> int:
         """Write where to start; return how many plans that are."""

@@ -28,7 +28,8 @@ from scp_mpc.geometry.no_go import NoGoSets
 from scp_mpc.geometry.polytopes import Polytopes
 from scp_mpc.geometry.risk import risk_bound
 from scp_mpc.models.model import Model
-from scp_mpc.obstacles.prediction import ObstaclePrediction, as_predictions, require_fitting
+from scp_mpc.obstacles.prediction import ObstaclePrediction
+from scp_mpc.obstacles.predictions import ObstaclePredictions, as_predictions
 from scp_mpc.problem import Problem
 from scp_mpc.scp.braking import braking
 from scp_mpc.scp.nodes import Nodes
@@ -62,7 +63,7 @@ class Step:
     problem: Problem
     x0: FloatArray
     x_ref: FloatArray
-    obstacles: tuple[ObstaclePrediction, ...]
+    obstacles: ObstaclePredictions
     nodes: Nodes
     means: FloatArray
     radii: FloatArray
@@ -90,10 +91,10 @@ class Step:
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
         state = as_array("x0", x0, (model.nx,))
         reference = as_reference(x_ref, N, model, state)
-        obstacles = as_predictions(obstacles)
-        if len(obstacles) > M:
-            raise TooManyObstaclesError("obstacles", f"{len(obstacles)} exceed max_obstacles = {M}")
-        require_fitting(obstacles, N, model.dim, model.dt)
+        known = as_predictions(obstacles)
+        if len(known) > M:
+            raise TooManyObstaclesError("obstacles", f"{len(known)} exceed max_obstacles = {M}")
+        stacked = ObstaclePredictions.of(known, N, model.dim, model.dt)
         uncertain = None
         if robot_covariance is not None:
             shape = (model.dim, model.dim)
@@ -102,12 +103,11 @@ class Step:
             require_positive_semidefinite("robot_covariance", uncertain)
         last = None if u_last is None else as_array("u_last", u_last, (model.nu,))
         nodes = Nodes.of(problem) if nodes is None else nodes
-        means = np.array([o.means for o in obstacles]).reshape(-1, N + 1, model.dim)
-        radii = problem.robot_radius + np.array([o.radius for o in obstacles])
-        radii = np.repeat(radii[:, None], nodes.size, axis=1)
-        means = nodes.interpolated(means)
-        given = problem, state, reference, obstacles, nodes, means, radii, uncertain
-        step = cls(*given, u_last=last, shapes=Polytopes.of(obstacles))
+        radii = np.repeat((problem.robot_radius + stacked.radii)[:, None], nodes.size, axis=1)
+        means = nodes.interpolated(stacked.means)
+        given = problem, state, reference, stacked, nodes, means, radii, uncertain
+        shapes = None if stacked.shapes is None else Polytopes.of(stacked)
+        step = cls(*given, u_last=last, shapes=shapes)
         return step if isinstance(problem.margin, Margin) else step.scaled_uniformly()
 
     @property
@@ -121,7 +121,7 @@ class Step:
         return self._covariances(self._grown)
 
     def _covariances(self, row: IntArray | None) -> FloatArray:
-        covariances = np.array([o.covariances for o in self.obstacles])
+        covariances = self.obstacles.covariances
         if row is not None:
             covariances = covariances[np.arange(self.count)[:, None], row]
         if self.robot_covariance is not None:
@@ -152,7 +152,7 @@ class Step:
         if self.problem.growth_time is None or not self.obstacles:
             return None
         last = int(np.ceil(self.problem.growth_time / self.problem.model.dt - _TICK))
-        stds = np.array([o.largest_std for o in self.obstacles])
+        stds = self.obstacles.largest_stds
         stage = np.arange(stds.shape[1])
         last = min(last, len(stage) - 1)
         return np.where((stage > last) & (stds > stds[:, last, None]), last, stage)
@@ -160,7 +160,7 @@ class Step:
     @cached_property
     def _plain_stds(self) -> FloatArray:
         """(J, N+1) largest standard deviations of the predictions [m]."""
-        stds = np.array([o.largest_std for o in self.obstacles])
+        stds = self.obstacles.largest_stds
         if self._grown is None:
             return stds
         return np.take_along_axis(stds, self._grown, axis=1)
@@ -189,7 +189,7 @@ class Step:
         if self.shapes is not None:
             j = self.shapes.slots
             gaps[j] = self.shapes.taken(j).distance(y[j])
-        reach = self.problem.robot_radius + np.array([o.radius for o in self.obstacles])
+        reach = self.problem.robot_radius + self.obstacles.radii
         return tuple(np.flatnonzero(gaps.min(axis=1) < reach - _TOUCH).tolist())
 
     @property
