@@ -84,6 +84,10 @@ class CasadiModel(FunctionModel):
         stopping_input: Likewise.
         state: Likewise.
 
+    Attributes:
+        dynamics: CasADi's function g of x and u.
+        stops: `stopping_input` as given.
+
     Raises:
         MissingExtraError: CasADi is not installed.
         InvalidArgumentError: Not a function of one x and one u, other symbols in the expression, or
@@ -108,7 +112,8 @@ class CasadiModel(FunctionModel):
         state: Callable[[FloatArray, FloatArray], Any] | None = None,
     ) -> None:
         """Differentiate, and check everything that can be checked."""
-        dynamics = _dynamics(function, x, u)
+        self.dynamics = dynamics = _dynamics(function, x, u)
+        self.stops = stopping_input
         nx, nu = dynamics.size1_in(0), dynamics.size1_in(1)
         self._rates, self._gradient, self._bend, self._after, self._sensitivity = _differentiated(
             dynamics, as_count("substeps", substeps), bool(discrete)

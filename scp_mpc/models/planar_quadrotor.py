@@ -7,9 +7,11 @@ Notation:
     g                                   gravity [m/s^2]
 """
 
+import math
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from math import atan2, cos, sin
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,9 +21,25 @@ from scp_mpc.errors import BoundsError
 from scp_mpc.models.model import as_period, indices
 from scp_mpc.models.runge_kutta import ComponentModel
 
+_PLAIN = SimpleNamespace(
+    **{name: getattr(math, name) for name in ("sin", "cos", "atan2", "hypot")}, fmin=min, fmax=max
+)
+
+
+class HoveringModel(ComponentModel):
+    """How a robot comes to hover, written once for numbers and for expressions."""
+
+    @abstractmethod
+    def stop(self, x: Any, lib: Any) -> tuple[Any, ...]:
+        """Return the nu entries of `stopping_input`; `lib` has functions for entries like x's."""
+
+    def stopping_input(self, x: FloatArray) -> FloatArray:
+        """Return the input (nu,) that, asked again after each interval, brings it to hover."""
+        return np.array(self.stop(np.asarray(x).tolist(), _PLAIN))
+
 
 @dataclass(frozen=True, eq=False)
-class PlanarQuadrotor(ComponentModel):
+class PlanarQuadrotor(HoveringModel):
     """p' = v, v' = T (sin phi, cos phi) - (0, g), phi' = omega, omega' = alpha.
 
         x = [p1, p2, phi, v1, v2, omega]    position across and up [m], tilt [rad], velocity [m/s],
@@ -84,18 +102,17 @@ class PlanarQuadrotor(ComponentModel):
         bent[..., 2, 6] = bent[..., 6, 2] = m3 * c - m4 * s
         return bent
 
-    def stopping_input(self, x: FloatArray) -> FloatArray:
-        """Return the input (2,) that, asked again after each interval, brings it to hover.
+    def stop(self, x: Any, lib: Any) -> tuple[Any, ...]:
+        """Return thrust that slows the speed down, and what tilts towards it.
 
-        Thrust that slows the speed down within twelve intervals, at half of gravity at most, and
-        a tilt that follows twice critically damped.
+        Within twelve intervals, at half of gravity at most; the tilt twice critically damped.
         """
         g, k = self.gravity, 0.5 / self.dt
-        _, _, phi, v1, v2, omega = np.asarray(x).tolist()
-        across, up = (min(max(-v * k / 6, -g / 2), g / 2) for v in (v1, v2))
-        wanted = atan2(across, g + up)
-        thrust = max(across * sin(phi) + (g + up) * cos(phi), 0.0)
-        return np.array([thrust, k * k * (wanted - phi) - 2 * k * omega])
+        _, _, phi, v1, v2, omega = x
+        across, up = (lib.fmin(lib.fmax(-v * k / 6, -g / 2), g / 2) for v in (v1, v2))
+        wanted = lib.atan2(across, g + up)
+        thrust = lib.fmax(across * lib.sin(phi) + (g + up) * lib.cos(phi), 0.0)
+        return thrust, k * k * (wanted - phi) - 2 * k * omega
 
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return states (..., 6) there, level, with velocities (..., 2)."""

@@ -11,19 +11,17 @@ Notation:
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import atan2, cos, hypot, sin
 from typing import Any
 
 import numpy as np
 
 from scp_mpc.arrays import FloatArray, as_count, frozen
 from scp_mpc.models.model import as_period, indices
-from scp_mpc.models.planar_quadrotor import as_gravity
-from scp_mpc.models.runge_kutta import ComponentModel
+from scp_mpc.models.planar_quadrotor import HoveringModel, as_gravity
 
 
 @dataclass(frozen=True, eq=False)
-class Quadrotor(ComponentModel):
+class Quadrotor(HoveringModel):
     """p' = v, v' = T b - g e_3, and the attitude follows the body rates.
 
         phi' = q1 + tan(theta) turn,  theta' = tilt,  psi' = turn / cos(theta)
@@ -159,21 +157,21 @@ class Quadrotor(ComponentModel):
             bent[..., row, column] = bent[..., column, row] = entry
         return bent
 
-    def stopping_input(self, x: FloatArray) -> FloatArray:
-        """Return the input (4,) that, asked again after each interval, brings it to hover.
+    def stop(self, x: Any, lib: Any) -> tuple[Any, ...]:
+        """Return thrust that slows the speed down, and body rates towards its attitude.
 
-        Thrust that slows the speed down within ten intervals, at half of gravity at most, and
-        an attitude that follows within two; the yaw stays.
+        Within ten intervals, at half of gravity at most; the attitude within two, at the same yaw.
         """
         g, rate = self.gravity, 0.5 / self.dt
-        _, _, _, v1, v2, v3, phi, theta, psi = np.asarray(x).tolist()
-        f1, f2, up = (min(max(-v * rate / 5, -g / 2), g / 2) for v in (v1, v2, v3))
+        _, _, _, v1, v2, v3, phi, theta, psi = x
+        f1, f2, up = (lib.fmin(lib.fmax(-v * rate / 5, -g / 2), g / 2) for v in (v1, v2, v3))
         f3 = g + up
-        ahead, left = cos(psi) * f1 + sin(psi) * f2, cos(psi) * f2 - sin(psi) * f1
-        pitching = rate * (atan2(ahead, f3) - theta)
-        rolling = rate * (atan2(-left, hypot(ahead, f3)) - phi)
-        lift = (ahead * sin(theta) + f3 * cos(theta)) * cos(phi) - left * sin(phi)
-        return np.array([max(lift, 0.0), rolling, pitching * cos(phi), -pitching * sin(phi)])
+        (cf, ct, cp), (sf, st, sp) = ([f(a) for a in (phi, theta, psi)] for f in (lib.cos, lib.sin))
+        ahead, left = cp * f1 + sp * f2, cp * f2 - sp * f1
+        pitching = rate * (lib.atan2(ahead, f3) - theta)
+        rolling = rate * (lib.atan2(-left, lib.hypot(ahead, f3)) - phi)
+        lift = (ahead * st + f3 * ct) * cf - left * sf
+        return lib.fmax(lift, 0.0), rolling, pitching * cf, -pitching * sf
 
     def state(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return states (..., 9) there, level at yaw 0, with velocities (..., 3)."""
