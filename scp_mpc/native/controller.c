@@ -202,7 +202,7 @@ static void follow(scp_core *core, const result *earlier)
     out->has_obstacle_free = 1;
     out->candidates = out->switched = 0;
     forget_alternatives(core);
-    hand_out(core, earlier);
+    write_plan(core, earlier);
 }
 
 /* The backup of a plan; or that of an earlier plan, where it is clear and this is not. */
@@ -254,7 +254,7 @@ static void brake_instead(scp_core *core)
     alone.J = 0;
     judge_braking(core, &alone, SCP_FALLBACK, &c->followed);
     core->out.candidates = core->out.switched = core->out.has_obstacle_free = 0;
-    hand_out(core, &c->followed);
+    write_plan(core, &c->followed);
     for (int i = 0; i < core->at.n; i++)
         if (isnan(core->out.plan.inputs[i]))
             core->out.plan.inputs[i] = 0.0;

@@ -598,7 +598,7 @@ void lay_out_controller(scp_core *core, arena *from);
 size_t scratch_of_controller(const scp_core *core);
 void solve_step(scp_core *core, const scp_iterate *last, const scp_iterate *last_free, int multi,
                 int brake_first);
-void hand_out(scp_core *core, const result *best); /* becomes the plan of the step */
+void write_plan(scp_core *core, const result *best); /* becomes the plan of the step */
 void shift_iterate(const scp_core *core, scp_iterate *it); /* in place: one step later */
 
 void begin_clock(scp_core *core);

@@ -253,6 +253,10 @@ void judge_nominal(scp_core *core, const nominal *n, relaxation level, int itera
     name_iterate(core, n, level == RELAX_ALL ? core->p.slack_weight : INFINITY, &to->it);
 }
 
+int is_ok(scp_status status) { return status <= SCP_BRAKING; }
+
+int is_certified(scp_status status) { return status == SCP_CONVERGED || status == SCP_SOFTENED; }
+
 /* Whether one plan is safe and the other is not, or its merit is better by `lead`. */
 int beats(const result *one, const result *other, double lead)
 {

@@ -323,7 +323,7 @@ static int rescue(scp_core *core, const scp_iterate *last, int brake_first, resu
 
 /* ---- the step */
 
-void hand_out(scp_core *core, const result *best)
+void write_plan(scp_core *core, const result *best)
 {
     scp_outputs *out = &core->out;
     out->status = best->status;
@@ -375,7 +375,7 @@ static void break_down(scp_core *core, const scp_iterate *last, int brake_first)
     core->now = &core->plain;
     forget_alternatives(core);
     fall_back(core, &core->plain, last, NULL, brake_first, &room->best);
-    hand_out(core, &room->best);
+    write_plan(core, &room->best);
 }
 
 /* Plan from `last`, the plan of the step before, shifted, and the one of then that ignored the
@@ -400,7 +400,7 @@ static void solve_steadily(scp_core *core, const scp_iterate *last, const scp_it
     if (is_clear(core, &free->at)) {
         judge_nominal(core, &free->at, RELAX_NONE, 0, free);
         if (is_certified(free->status) || (is_ok(free->status) && !core->plain.J)) {
-            hand_out(core, free);
+            write_plan(core, free);
             return;
         }
     }
@@ -428,7 +428,7 @@ static void solve_steadily(scp_core *core, const scp_iterate *last, const scp_it
     }
     if (!alternatives)
         forget_alternatives(core);
-    hand_out(core, best);
+    write_plan(core, best);
     learn_time(core, TASK_ENDING, ending, 1);
 }
 
