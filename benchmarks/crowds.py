@@ -41,6 +41,7 @@ def main(
     recordings: list[Path] | None = None,
     runs: int | None = None,
     jobs: int = 1,
+    only: str = "",
     echo: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Run what is missing and write table and numbers.
@@ -51,10 +52,11 @@ def main(
         recordings: Files for the first two.
         runs: How many of each group; their seeds are 0, 1, ...
         jobs: Processes.
+        only: Part of the names of the groups to run.
         echo: Takes the Markdown table.
     """
     count = RUNS[kind] if runs is None else runs
-    rows = in_one_thread(_rows, kind, recordings or [], count, out, jobs)
+    rows = in_one_thread(_rows, kind, recordings or [], count, out, jobs, only)
     found = [
         {"group": group, **summed(some), **progress_of(some), "moving": moving(some)}
         for group, some in rows.items()
@@ -63,9 +65,10 @@ def main(
 
 
 def _rows(
-    kind: str, recordings: list[Path], runs: int, out: Path, jobs: int
+    kind: str, recordings: list[Path], runs: int, out: Path, jobs: int, only: str
 ) -> dict[Group, list[dict[str, Any]]]:
-    episodes = dict(_episodes(kind, recordings))
+    every = dict(_episodes(kind, recordings))
+    episodes = {group: one for group, one in every.items() if only in ", ".join(group)}
     rows = {}
     with progress(runs * len(episodes), "run") as advance:
         for group, episode in episodes.items():
@@ -157,6 +160,7 @@ if __name__ == "__main__":
     parser.add_argument("--recordings", type=Path, nargs="+", help="obsmat.txt, or frame id x y")
     parser.add_argument("--runs", type=int, help="of each group")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--only", default="", help="groups whose names hold this")
     arguments = parser.parse_args()
     if arguments.kind != "reacting" and not arguments.recordings:
         parser.error(f"{arguments.kind} needs --recordings")
