@@ -292,10 +292,21 @@ static void across(const search *at, const double *z, double *x)
         x[i] = dot(at->in->span[i], held_row(at, i), z);
 }
 
-static void back_across(const search *at, double share, const double *x, double *z)
+static void back_across(const search *at, double share, const double *x, double *restrict z)
 {
-    for (int i = 0; i < at->s->count; i++)
-        axpy(at->in->span[i], share * x[i], held_row(at, i), z);
+    const int *span = at->in->span;
+    int i = 0, k = at->s->count;
+    for (; i + 4 <= k; i += 4) { /* four at a time, to load z less often */
+        const double *restrict a = held_row(at, i), *restrict b = held_row(at, i + 1);
+        const double *restrict c = held_row(at, i + 2), *restrict d = held_row(at, i + 3);
+        double p = share * x[i], q = share * x[i + 1], r = share * x[i + 2], t = share * x[i + 3];
+        int low = span[i] > span[i + 1] ? span[i] : span[i + 1];
+        int high = span[i + 2] > span[i + 3] ? span[i + 2] : span[i + 3];
+        for (int j = 0; j < (low > high ? low : high); j++)
+            z[j] += (p * a[j] + q * b[j]) + (r * c[j] + t * d[j]);
+    }
+    for (; i < k; i++)
+        axpy(span[i], share * x[i], held_row(at, i), z);
 }
 
 /* Least pivot, as a share of the largest one. */
