@@ -217,13 +217,16 @@ static void leave(const search *of, int j, int node, int outward, const double *
         leave_ellipsoid(of->core, &set, outward, side, p);
         return;
     }
+    if (!outward) {
+        leave_walls(of->core, of->at, 1, &j, node, side, 0, p);
+        return;
+    }
     double away[3], y[3];
     difference(d, p, set.mean, y);
-    if (outward)
-        solid_distance(d, set.body, y, NULL, away, NULL);
+    solid_distance(d, set.body, y, NULL, away, NULL);
     for (int l = 0; l < d; l++)
-        away[l] = outward ? away[l] + 0.5 * side[l] : side[l];
-    const double length = outward ? sqrt(inner(d, away, away)) : 1.0;
+        away[l] += 0.5 * side[l];
+    const double length = sqrt(inner(d, away, away));
     for (int l = 0; l < d; l++)
         away[l] /= length;
     leave_walls(of->core, of->at, 1, &j, node, away, 0, p);

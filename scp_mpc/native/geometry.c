@@ -130,7 +130,7 @@ void no_go_of(const scp_core *core, const step *at, int j, int node, no_go *set)
 static inline double linearise_exact(const int d, const no_go *set, const double *position,
                                      double s, const double *before, double *a)
 {
-    double offset[3], y[3], side[3], e[3], n[3];
+    double offset[3], y[3] = {0}, side[3] = {0}, e[3] = {0}, n[3];
     difference(d, position, set->mean, offset);
     to_eigenframe(d, set->rotation, offset, y);
     to_eigenframe(d, set->rotation, before, side);
@@ -236,7 +236,7 @@ static inline void curvature_exact(const int d, const no_go *set, double s, doub
                                    const double *a, double *L)
 {
     const int k = d - 1;
-    double n[3], pull[3], T[6], M[4], root[4], half[6], pulled[2];
+    double n[3] = {0}, pull[3], T[6], M[4], root[4], half[6], pulled[2];
     const double width = larger(-a[d], POINT), sd = larger(g + set->radius, POINT);
     to_eigenframe(d, set->rotation, a, n);
     tangents(d, n, T);

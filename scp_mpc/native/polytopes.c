@@ -139,7 +139,7 @@ double solid_distance(int d, const solid *body, const double *y, const double *s
 void solid_over(int d, const solid *body, int face, const double *y, double *to)
 {
     const double *n = body->normal + face * d;
-    double middle[3] = {0}, way[3], size = 0.0, most = 1.0;
+    double middle[3] = {0}, way[3] = {0}, size = 0.0, most = 1.0;
     int count = 0;
     for (int v = 0; v < body->corners * d; v++)
         size = larger(size, fabs(body->corner[v]));
