@@ -283,12 +283,12 @@ static void remember(scp_core *core, int sound)
         copy_iterate(core, &out->obstacle_free, &c->last_free);
 }
 
-int scp_step(scp_core *core)
+/* What a step brings; the input last applied is remembered where that is not told. */
+static int read_with_memory(scp_core *core)
 {
-    controller *c = core->memory;
+    const controller *c = core->memory;
     scp_inputs *in = &core->in;
     int borrowed = !in->has_u_last && core->p.limits_rates && c->has_applied;
-    begin_clock(core);
     if (borrowed) {
         memcpy(in->u_last, c->applied, (size_t)core->at.nu * sizeof(double));
         in->has_u_last = 1;
@@ -296,6 +296,15 @@ int scp_step(scp_core *core)
     int wrong = read_step(core);
     if (borrowed)
         in->has_u_last = 0;
+    return wrong;
+}
+
+int scp_step(scp_core *core)
+{
+    controller *c = core->memory;
+    const scp_inputs *in = &core->in;
+    begin_clock(core);
+    int wrong = read_with_memory(core);
     if (wrong)
         return wrong;
     shift_alternatives(core);
@@ -313,4 +322,68 @@ int scp_step(scp_core *core)
     remember(core, sound);
     core->out.seconds = elapsed(core);
     return 0;
+}
+
+/* Without predictions: brake, whatever is in the way. */
+int scp_brake(scp_core *core)
+{
+    controller *c = core->memory;
+    int count = core->in.count;
+    core->in.count = 0;
+    begin_clock(core);
+    int wrong = read_with_memory(core);
+    core->in.count = count;
+    if (wrong)
+        return wrong;
+    ignore_alternatives(core);
+    forget_alternatives(core);
+    brake_instead(core);
+    core->out.kkt = core->out.solved = core->out.ranked = core->out.cut = core->out.infeasible = 0;
+    c->steps = -1;
+    remember(core, 1);
+    core->out.seconds = elapsed(core);
+    return 0;
+}
+
+/* ---- memory */
+
+int scp_backup(const scp_core *core, const double **inputs)
+{
+    const controller *c = core->memory;
+    *inputs = c->backup;
+    return c->steps;
+}
+
+static void memo_iterate(const scp_core *core, memo *m, scp_iterate *it)
+{
+    const layout *at = &core->at;
+    size_t N = (size_t)at->N, nx = (size_t)at->nx, n = (size_t)at->n, slots = (size_t)at->most_pairs;
+    memo_doubles(m, (N + 1) * nx, it->states);
+    memo_doubles(m, n, it->inputs);
+    memo_doubles(m, (size_t)at->M, it->s);
+    memo_doubles(m, slots, it->slack);
+    memo_ints(m, 1, &it->has_multipliers);
+    memo_doubles(m, N * nx, it->dynamics);
+    memo_doubles(m, n, it->input_bounds);
+    memo_doubles(m, (size_t)at->M, it->margin);
+    memo_doubles(m, slots, it->obstacles);
+    memo_doubles(m, slots, it->pins);
+    memo_doubles(m, N * (size_t)at->nb, it->state_bounds);
+    memo_doubles(m, n, it->rates);
+}
+
+void memo_controller(scp_core *core, memo *m)
+{
+    controller *c = core->memory;
+    memo_iterate(core, m, &c->last);
+    memo_iterate(core, m, &c->last_free);
+    memo_doubles(m, (size_t)core->at.nu, c->applied);
+    memo_doubles(m, (size_t)core->at.n, c->backup);
+    memo_ints(m, 1, &c->has_last);
+    memo_ints(m, 1, &c->has_last_free);
+    memo_ints(m, 1, &c->has_applied);
+    memo_ints(m, 1, &c->steps);
+    memo_ints(m, 1, &c->touching);
+    memo_ints(m, 1, &c->standing);
+    memo_ints(m, 1, &core->out.replayed);
 }

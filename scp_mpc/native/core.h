@@ -217,6 +217,7 @@ typedef enum { QP_SOLVED, QP_INFEASIBLE, QP_UNSOLVED, QP_CUT } qp_end;
 typedef struct {
     double *K;        /* (N, nu, nx) feedback of the plan that nothing constrains */
     double *T;        /* (N, nu, nu) inverses of lower Cholesky factors of 2 R + B'P B */
+    double *A;        /* (N, nx, nx) closed loop A - B K */
     double *E;        /* (N, nx, n) responses of e to v */
     double *S;        /* (ny, nv) */
 } sensitivity;
@@ -608,5 +609,19 @@ int room_for(scp_core *core, task what, int most, task then, int spare);
 typedef struct { double began, booked; } lap;
 lap mark_time(const scp_core *core);
 void learn_time(scp_core *core, task what, lap since, int times);
+
+/* ---- memory.c */
+
+/* Numbers on their way to another core, or from one. */
+typedef struct {
+    double *numbers; /* NULL: they are only counted */
+    size_t count;
+    int recalls;
+} memo;
+
+void memo_doubles(memo *m, size_t n, double *values);
+void memo_ints(memo *m, size_t n, int *values);
+void memo_controller(scp_core *core, memo *m);   /* controller.c */
+void memo_alternatives(scp_core *core, memo *m); /* multi_start.c */
 
 #endif

@@ -150,6 +150,11 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "scp_input_name": (ctypes.c_char_p, [c_int]),
     "scp_step": (c_int, [c_void_p]),
     "scp_reset": (None, [c_void_p]),
+    "scp_brake": (c_int, [c_void_p]),
+    "scp_backup": (c_int, [c_void_p, POINTER(_doubles)]),
+    "scp_memory_size": (c_size_t, [c_void_p]),
+    "scp_remember": (None, [c_void_p, c_void_p]),
+    "scp_recall": (None, [c_void_p, c_void_p]),
 }
 
 

@@ -159,6 +159,17 @@ void shift_alternatives(scp_core *core)
     }
 }
 
+void memo_alternatives(scp_core *core, memo *m)
+{
+    multi_room *room = core->multi;
+    size_t size = (size_t)core->at.nf + (size_t)core->at.most_pairs;
+    memo_ints(m, 1, &room->made.count);
+    memo_ints(m, SCP_MOST_CANDIDATES, room->made.obstacle);
+    memo_ints(m, SCP_MOST_CANDIDATES, room->made.number);
+    for (int i = 0; i < most_candidates(core); i++)
+        memo_doubles(m, size, room->base[i].force);
+}
+
 static const double *known_force(const multi_room *room, int obstacle, int number)
 {
     for (int i = 0; i < room->known.count; i++)

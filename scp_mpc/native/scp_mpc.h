@@ -210,6 +210,17 @@ SCP_API const char *scp_input_name(int number);
 SCP_API int scp_step(scp_core *core);
 SCP_API void scp_reset(scp_core *core);
 
+/* A step without predictions, as where they are too old: brakes, whatever is in the way. */
+SCP_API int scp_brake(scp_core *core);
+
+/* What is left of the last step's backup: inputs (steps, nu). Returns the steps, -1 for no backup. */
+SCP_API int scp_backup(const scp_core *core, const double **inputs);
+
+/* What a core remembers of the steps before, for another core of the same problem. */
+SCP_API size_t scp_memory_size(scp_core *core); /* how many numbers */
+SCP_API void scp_remember(scp_core *core, double *numbers);
+SCP_API void scp_recall(scp_core *core, double *numbers);
+
 #ifdef __cplusplus
 }
 #endif
