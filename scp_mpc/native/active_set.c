@@ -809,12 +809,14 @@ static qp_end admit(const search *at, int p, double lacks, int most, int *system
             return QP_UNSOLVED;
         ++*systems;
         double reach = project(at, in->row, span);
+        if (!(square <= DBL_MAX && reach >= 0)) /* no numbers */
+            return QP_UNSOLVED;
         double whole = reach > DEPENDENT * square ? lacks / reach : (double)INFINITY;
         double own = yields ? fabs(s->force[p]) : weight - fabs(s->force[p]);
         way free = room_of(at, sign);
         double length = fmin(fmin(whole, own), free.length);
         if (!(length <= DBL_MAX))
-            return isnan(length) ? QP_UNSOLVED : QP_INFEASIBLE;
+            return QP_INFEASIBLE;
         axpy(at->nv, length * sign, in->z, at->w);
         lacks -= length * reach;
         s->force[p] += length * sign;
