@@ -271,7 +271,8 @@ def _joined(qp: CondensedQP, solution: QPSolution, systems: int, most: int) -> S
     l1_weight = np.full(len(force), np.inf) if qp.l1_weight is None else qp.l1_weight
     while True:
         depth, side = qp.violations(v)
-        depth = np.where(relaxed, -depth, np.where(active != 0, 0.0, depth))
+        room = np.where(side == active, -depth, np.abs(depth))  # of those that yield; or far beyond
+        depth = np.where(relaxed, room, np.where(active != 0, 0.0, depth))
         p = int(depth.argmax())
         if depth[p] <= _ACCURACY:
             if systems > 1:  # rounding of all the steps goes, and the factor comes

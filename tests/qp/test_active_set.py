@@ -147,6 +147,17 @@ def test_any_guess_leads_to_the_same_point_and_the_right_one_at_once(l1_weight):
     np.testing.assert_array_equal(again.solution.active, reference.active)
 
 
+@given(seed=SEEDS)
+def test_a_guess_that_yields_at_the_wrong_bound_is_repaired(seed):
+    """The point it leads to can be beyond the other bound."""
+    p, rng = program(seed), np.random.default_rng(seed)
+    soft = np.concatenate([np.ones(12, bool), np.zeros(6, bool)])
+    p = replace(p, l1_weight=np.where(soft, 3.0, np.inf))
+    guess = np.where(soft, rng.choice([-1, 1], 18), 0)
+    end = settled(p, guess, soft, PLENTY)
+    np.testing.assert_allclose(end.solution.v, cold(p).solution.v, atol=1e-8)
+
+
 @given(seed=SEEDS, sizes=SIZES)
 def test_one_wrong_constraint_is_repaired(seed, sizes):
     p, rng = program(seed, *sizes), np.random.default_rng(seed)
