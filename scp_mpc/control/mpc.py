@@ -13,6 +13,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
+from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +33,9 @@ from scp_mpc.scp.plan import Plan, Status
 from scp_mpc.scp.solver import SCP
 from scp_mpc.scp.step import Step
 from scp_mpc.settings import Settings
+
+if TYPE_CHECKING:
+    from scp_mpc.scp.native import NativeEngine
 
 _log = logging.getLogger(__name__)
 
@@ -73,6 +78,7 @@ class MPC:
 
     def _forget(self) -> None:
         self._last: Iterate | None = None
+        self._made: Plan | None = None  # by the native core
         self._applied: FloatArray | None = None
         self._backup: FloatArray | None = None
         self._steps_touching = self._steps_standing = 0
@@ -80,6 +86,8 @@ class MPC:
         self._counts.clear()
         self.overruns = self.replayed = self._left_out = 0
         self._memory.reset()
+        if self._solver.native is not None:
+            self._solver.native.core.reset()
 
     @property
     def problem(self) -> Problem:
@@ -106,6 +114,8 @@ class MPC:
 
     def nominal(self) -> Iterate | None:
         """The guess from which the next step starts; None before the first step."""
+        if self._made is not None:
+            return self._made.iterate.shifted(self.problem.model)
         return None if self._last is None else self._shifted()
 
     def step(
@@ -139,6 +149,10 @@ class MPC:
             InvalidArgumentError: Or one of its subclasses. The controller is then as before.
             ConcurrentUseError: Another thread is using this controller.
         """
+        native = self._solver.native
+        if native is not None:
+            given = x0, x_ref, obstacles, time, robot_covariance, u_last
+            return self._native_step(native, perf_counter(), *given)
         clock = self._solver.timed(self._deadline)
         self._enter()
         try:
@@ -154,13 +168,16 @@ class MPC:
             ahead = bool(recall.obstacles) or self._backups.always
             if recall.stale is None and ahead and clock.allows("backup"):
                 with clock.task("backup"):
-                    given = x0, x_ref, recall.obstacles, robot_covariance, last
-                    plan, backup = self._backed(plan, *given)
+                    known_ones = recall.obstacles
+                    plan, backup = self._backed(plan, x0, x_ref, known_ones, robot_covariance, last)
                 plan = replace(plan, timing=replace(plan.timing, total=clock.elapsed()))
             sound = self._within(plan, last)
             if not sound:
                 plan = self._bounded(plan, x0, x_ref, last)
-            plan = self._counted(plan, known)
+            left_out = max(known - self.problem.max_obstacles, 0)
+            if left_out:
+                plan = replace(plan, left_out=left_out)
+            self._tell(left_out)
             self._memory.commit(recall)
             self._keep(plan, recall, plan.iterate if sound else None)
             self._backup = backup if sound else None
@@ -200,20 +217,58 @@ class MPC:
         require_fitting(obstacles, problem.horizon, problem.model.dim, problem.model.dt)
         step, nominal = Step.read(problem, x0, x_ref, (), u_last=last), self.nominal()
         ahead = step.x_ref if nominal is None else nominal.states + (step.x0 - nominal.states[0])
-        backup = self._backups.path(step.x0, self._backup, last)
+        native, inputs = self._solver.native, self._backup
+        if native is not None:
+            inputs = native.core.backup()
+        backup = self._backups.path(step.x0, inputs, last)
         paths = np.stack([ahead, backup])[..., problem.model.position]
         return most_dangerous(obstacles, paths, problem.max_obstacles)
 
-    def _counted(self, plan: Plan, known: int) -> Plan:
-        """The plan with how many of the known obstacles were left out; said once, too."""
-        left_out, before = max(known - self.problem.max_obstacles, 0), self._left_out
-        self._left_out = left_out
-        if left_out and not before:
+    def _tell(self, left_out: int) -> None:
+        """Say once that some of the known obstacles are left out."""
+        if left_out and not self._left_out:
+            slots = self.problem.max_obstacles
             _log.warning(
                 "%d obstacles, but max_obstacles = %d: the nearest to the plan are kept",
-                *(known, self.problem.max_obstacles),
+                *(left_out + slots, slots),
             )
-        return replace(plan, left_out=left_out) if left_out else plan
+        self._left_out = left_out
+
+    def _native_step(
+        self,
+        native: "NativeEngine",
+        began: float,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        time: float | None,
+        robot_covariance: ArrayLike | None,
+        u_last: ArrayLike | None,
+    ) -> Plan:
+        """`step` with the native core, which remembers by itself what is remembered here."""
+        self._enter()
+        try:
+            recall = self._memory.recall(time, obstacles)
+            left_out = max(len(recall.obstacles) - self.problem.max_obstacles, 0)
+            if left_out:
+                last = None if u_last is None else as_array("u_last", u_last)
+                recall = recall._replace(obstacles=self._chosen(x0, x_ref, recall.obstacles, last))
+            if recall.stale is None:
+                given = x0, x_ref, recall.obstacles, robot_covariance, u_last
+                plan = native.step(began, *given, left_out)
+            else:
+                self._require_brakeable(x0, x_ref, recall, robot_covariance)
+                plan = native.brake(began, x0, x_ref, u_last)
+            self._tell(left_out)
+            self._memory.commit(recall)
+            self._made, self._obstacles = plan, recall.obstacles
+            self._counts[plan.status] += 1
+            self.replayed = native.core.outputs.replayed
+            if self._deadline is not None and plan.timing.total > self._deadline:
+                self.overruns += 1
+            return plan
+        finally:
+            self._busy.release()
 
     def _plan(
         self,
@@ -234,12 +289,22 @@ class MPC:
                 if other.ok and (not plan.ok or other.cost < _BETTER * plan.cost):
                     return other
             return plan
-        if self.settings.staleness.beyond == "refuse":
+        self._require_brakeable(x0, x_ref, recall, robot_covariance)
+        return self._solver.brake(x0, x_ref, Status.STALE, last)
+
+    def _require_brakeable(
+        self,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        recall: Recall,
+        robot_covariance: ArrayLike | None,
+    ) -> None:
+        """Where predictions are too old: raise, or say that the robot brakes."""
+        if recall.stale is not None and self.settings.staleness.beyond == "refuse":
             raise recall.stale
         # Bad arguments are refused before the robot brakes.
         Step.read(self.problem, x0, x_ref, recall.obstacles, robot_covariance)
         _log.warning("%s: braking", recall.stale)
-        return self._solver.brake(x0, x_ref, Status.STALE, last)
 
     def _backed(
         self,

@@ -10,12 +10,13 @@ Notation as in `scp_mpc.h`.
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from scp_mpc.arrays import FloatArray
+from scp_mpc.arrays import FloatArray, frozen
 from scp_mpc.deadline import Timer
 from scp_mpc.errors import InvalidArgumentError
 from scp_mpc.models.model import Model
@@ -37,38 +38,33 @@ from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 
 _ALIGNED = 64  # bytes
+_PLANS = ("plan", "obstacle_free")  # of the outputs
 _PARTS = ("corners", "vertices"), ("faces", "normals"), ("edges", "edges")  # of a `Solid`
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class IterateLayout:
     """Where the arrays of a `scp_iterate` are, in doubles from the first of them.
 
     Attributes:
-        address: Of the first.
-        size: From there to the end of the last one.
         places: Where each begins, and its shape, by name.
+        size: To the end of the last one.
     """
 
-    address: int
-    size: int
     places: dict[str, tuple[int, tuple[int, ...]]]
+    size: int
 
     @classmethod
     def of(cls, struct: IterateStruct, shapes: dict[str, tuple[int, ...]]) -> "IterateLayout":
-        """Read the addresses."""
+        """Read the addresses: the states come first."""
         there = {name: _address(getattr(struct, name)) for name in shapes}
-        first = min(at for name, at in there.items() if np.prod(shapes[name]))
+        first = there["states"]
         places = {
             name: ((there[name] - first) // 8 if np.prod(shape) else 0, shape)
             for name, shape in shapes.items()
         }
-        return cls(first, max(at + int(np.prod(s)) for at, s in places.values()), places)
-
-    def part(self, numbers: FloatArray, name: str) -> FloatArray:
-        """One of the arrays within all of their numbers (size,)."""
-        at, shape = self.places[name]
-        return numbers[at : at + int(np.prod(shape))].reshape(shape)
+        assert min(at for at, _ in places.values()) == 0
+        return cls(places, max(at + int(np.prod(shape)) for at, shape in places.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +73,31 @@ class Outcome:
 
     Attributes:
         raw: The struct `scp_outputs`.
-        numbers: Those of the iterates in it, by name.
-        layouts: Where in them is what.
+        plan: Numbers of the plan.
+        obstacle_free: Those of the plan that ignores the obstacles; None where it is the same.
+        layout: Where in them is what.
     """
 
     raw: bytes
-    numbers: dict[str, FloatArray]
-    layouts: dict[str, IterateLayout]
+    plan: FloatArray
+    obstacle_free: FloatArray | None
+    layout: IterateLayout
 
     @property
     def outputs(self) -> Outputs:
         """The struct; its pointers lead nowhere."""
         return Outputs.from_buffer_copy(self.raw)
 
+    def part(self, numbers: FloatArray, name: str) -> FloatArray:
+        """One of the arrays within all of the numbers of a plan."""
+        at, shape = self.layout.places[name]
+        return numbers[at : at + prod(shape)].reshape(shape)
+
     def iterate(self, which: str) -> tuple[bool, dict[str, FloatArray]]:
-        """Whether an iterate has multipliers, and its arrays by name."""
-        numbers, layout = self.numbers[which], self.layouts[which]
+        """Whether the "plan" or the "obstacle_free" one has multipliers; its arrays by name."""
+        numbers: FloatArray = getattr(self, which)
         has = bool(getattr(self.outputs, which).has_multipliers)
-        return has, {name: layout.part(numbers, name) for name in layout.places}
+        return has, {name: self.part(numbers, name) for name in self.layout.places}
 
 
 class NativeCore:
@@ -135,6 +138,7 @@ class NativeCore:
                 most = values[f"max_{name}"]
                 values[f"max_{name}"] = max(most, len(getattr(solid, part)))
         struct, self._kept = _filled(values)
+        self._calls_back = values["model"] == OWN_MODEL or timer is not None
         if values["model"] == OWN_MODEL:
             self._bind(struct, problem.model)
         if deadline is not None:
@@ -198,13 +202,10 @@ class NativeCore:
             {name: _view(struct, name, shape) for name, shape in iterate.items()}
             for struct in self._guesses
         ]
-        self._layouts = {
-            name: IterateLayout.of(getattr(self.outputs, name), iterate)
-            for name in ("plan", "obstacle_free")
-        }
-        self._numbers = {
-            name: _numbers(layout.address, layout.size) for name, layout in self._layouts.items()
-        }
+        self._layout = IterateLayout.of(self.outputs.plan, iterate)
+        words = np.frombuffer(self.outputs, dtype=np.uintp)
+        self._plans = [words[getattr(Outputs, n).offset // 8 :][:1] for n in _PLANS]
+        self._numbers: dict[int, FloatArray] = {}
         self._room = {"corners": V, "faces": F, "edges": E}
         self._solids: list[Solid] = []
 
@@ -254,19 +255,59 @@ class NativeCore:
 
     def step(self) -> str | None:
         """`solve` with memory: from the last plan, with its backup."""
-        return self._done(self._call.scp_step(self._core))
+        return self._remembered(self._call.scp_step)
 
     def reset(self) -> None:
         """Forget the steps before."""
         self._call.scp_reset(self._core)
 
+    def brake(self) -> str | None:
+        """A step without predictions, with memory, too."""
+        return self._remembered(self._call.scp_brake)
+
+    def _remembered(self, call: Callable[[int], int]) -> str | None:
+        """Where the caller's own code raises meanwhile, nothing of the step is remembered."""
+        before = self.memory if self._calls_back else None
+        wrong = call(self._core)
+        if self._error is not None and before is not None:
+            self.memory = before
+        return self._done(wrong)
+
     def outcome(self) -> Outcome:
         """Copy what came out."""
-        numbers = {"plan": self._numbers["plan"].copy()}
-        if self.outputs.has_obstacle_free:
-            numbers["obstacle_free"] = self._numbers["obstacle_free"].copy()
+        plan = self._copied(self._plans[0])
+        free = self._copied(self._plans[1]) if self.outputs.has_obstacle_free else None
         raw = ctypes.string_at(self._at_outputs, ctypes.sizeof(Outputs))
-        return Outcome(raw, numbers, self._layouts)
+        return Outcome(raw, plan, free, self._layout)
+
+    def _copied(self, pointer: NDArray[np.uintp]) -> FloatArray:
+        """Numbers of an iterate of the core's, which come and go among a few places."""
+        address = int(pointer[0])
+        if address not in self._numbers:
+            self._numbers[address] = _numbers(address, self._layout.size)
+        return frozen(self._numbers[address].copy())
+
+    def backup(self) -> FloatArray | None:
+        """Inputs (k, nu) that are left of the last step's backup; None for no backup."""
+        nu, pointer = self.views["u_last"].shape[0], ctypes.POINTER(ctypes.c_double)()
+        steps = self._call.scp_backup(self._core, pointer)
+        if steps < 0:
+            return None
+        return _numbers(_address(pointer), steps * nu).reshape(steps, nu).copy()
+
+    @property
+    def memory(self) -> FloatArray:
+        """What is remembered of the steps before, for another core of the same problem."""
+        numbers = np.empty(self._call.scp_memory_size(self._core))
+        self._call.scp_remember(self._core, numbers.ctypes.data)
+        return numbers
+
+    @memory.setter
+    def memory(self, numbers: FloatArray) -> None:
+        if numbers.shape != (self._call.scp_memory_size(self._core),):
+            raise InvalidArgumentError("memory", f"shape {numbers.shape} is of another problem")
+        numbers = np.ascontiguousarray(numbers)
+        self._call.scp_recall(self._core, numbers.ctypes.data)
 
     def _done(self, wrong: int) -> str | None:
         self._raise()
@@ -287,7 +328,7 @@ class NativeCore:
         def call(*arguments: Any) -> int:
             try:
                 function(*arguments)
-            except (ArithmeticError, np.linalg.LinAlgError):
+            except (ArithmeticError, np.linalg.LinAlgError, InvalidArgumentError):
                 return 1
             except BaseException as error:  # nothing may pass through the core
                 self._error = self._error or error

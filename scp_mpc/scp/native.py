@@ -28,7 +28,8 @@ from scp_mpc.scp.step import Step
 from scp_mpc.settings import Settings
 
 _STATUSES = [status for status in Status if status is not Status.STALE]  # as in `scp_status`
-_DUALS = ("dynamics", "input_bounds", "margin", "obstacles", "pins", "state_bounds", "rates")
+_DUALS = {name: name for name in ("dynamics", "margin", "obstacles", "rates")}
+_DUALS |= {"inputs": "input_bounds", "slack": "pins", "states": "state_bounds"}
 _COUNTS = {"kkt": "kkt", "native": "solved"} | {n: n for n in ("ranked", "cut", "infeasible")}
 
 
@@ -59,19 +60,21 @@ class NativePlan(Plan):
     _given: Given
 
     @classmethod
-    def of(cls, core: NativeCore, given: Given, timing: Timing) -> "NativePlan":
+    def of(
+        cls, core: NativeCore, given: Given, timing: Timing, status: Status | None, left_out: int
+    ) -> "NativePlan":
         """The plan of the step that the core has just made."""
         plan, outputs = object.__new__(cls), core.outputs
         vars(plan).update(
             _outcome=core.outcome(),
             _given=given,
             timing=timing,
-            status=_STATUSES[outputs.status],
+            status=_STATUSES[outputs.status] if status is None else status,
             cost=outputs.cost,
             iterations=outputs.iterations,
             switched=bool(outputs.switched),
             history=(),
-            left_out=0,
+            left_out=left_out,
         )
         return plan
 
@@ -91,21 +94,21 @@ class NativePlan(Plan):
 
 def _iterate(outcome: Outcome, given: Given, _: Plan) -> Iterate:
     free = None
-    if outcome.outputs.has_obstacle_free:
-        free = _named(*outcome.iterate("obstacle_free"), given, None)
-    return _named(*outcome.iterate("plan"), given, free)
+    if outcome.obstacle_free is not None:
+        free = _named(given.problem, None, *outcome.iterate("obstacle_free"))
+    return _named(given.problem, free, *outcome.iterate("plan"))
 
 
 def _named(
-    has_multipliers: bool, part: dict[str, FloatArray], given: Given, free: Iterate | None
+    problem: Problem, free: Iterate | None, has_multipliers: bool, part: dict[str, FloatArray]
 ) -> Iterate:
-    """An iterate of the core's arrays."""
+    """An iterate of its arrays."""
     duals = None
     if has_multipliers:
-        values = [part[name] for name in _DUALS]
-        if not given.problem.limits_rates:
-            values[-1] = np.zeros((0, 0))
-        duals = Multipliers(*values)
+        values = {name: part[theirs] for name, theirs in _DUALS.items()}
+        if not problem.limits_rates:
+            del values["rates"]
+        duals = Multipliers(**values)
     primal = part["states"], part["inputs"], part["s"], part["slack"]
     return Iterate(*primal, duals, free).frozen()
 
@@ -145,8 +148,8 @@ def _step(_: Outcome, given: Given, plan: Plan) -> Step:
 
 _PARTS: dict[str, Callable[[Outcome, Given, Plan], Any]] = {
     "iterate": _iterate,
-    "X": lambda _, __, plan: plan.iterate.states,
-    "U": lambda _, __, plan: plan.iterate.inputs,
+    "X": lambda outcome, _, __: outcome.part(outcome.plan, "states"),
+    "U": lambda outcome, _, __: outcome.part(outcome.plan, "inputs"),
     "s": lambda _, given, plan: plan.iterate.s[: len(given.obstacles)],
     "slack": _slack,
     "x_slack": lambda _, given, plan: frozen(given.problem.excess(plan.X)),
@@ -203,20 +206,59 @@ class NativeEngine:
         given = self._write(x0, x_ref, obstacles, robot_covariance, u_last)
         guesses = 0
         if nominal is not None:
-            nominal = nominal.unwrapped(self._problem.model, given.x0)
-            guesses = self._guess(nominal)
+            guesses = self._guess(nominal.unwrapped(self._problem.model, given.x0))
         wrote = perf_counter()
-        wrong = self.core.solve(guesses, multi_start, brake_first)
-        return self._plan(given, wrong, began, wrote)
+        return self._plan(given, self.core.solve(guesses, multi_start, brake_first), began, wrote)
 
-    def _plan(self, given: Given, wrong: str | None, began: float, wrote: float) -> Plan:
+    def step(
+        self,
+        began: float,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        obstacles: Sequence[ObstaclePrediction],
+        robot_covariance: ArrayLike | None = None,
+        u_last: ArrayLike | None = None,
+        left_out: int = 0,
+    ) -> Plan:
+        """A step of the controller, with what the core remembers of those before.
+
+        Args:
+            began: When, by the machine's clock [s].
+            x0: As in `MPC.step`, like the others.
+            x_ref: Likewise.
+            obstacles: As many as there are slots for at most.
+            robot_covariance: As in `MPC.step`.
+            u_last: Likewise.
+            left_out: How many there are besides.
+        """
+        given = self._write(x0, x_ref, obstacles, robot_covariance, u_last)
+        wrote = perf_counter()
+        return self._plan(given, self.core.step(), began, wrote, left_out=left_out)
+
+    def brake(
+        self, began: float, x0: ArrayLike, x_ref: ArrayLike, u_last: ArrayLike | None
+    ) -> Plan:
+        """A step of the controller without predictions, for they are too old."""
+        given = self._write(x0, x_ref, (), None, u_last)
+        wrote = perf_counter()
+        return self._plan(given, self.core.brake(), began, wrote, Status.STALE)
+
+    def _plan(
+        self,
+        given: Given,
+        wrong: str | None,
+        began: float,
+        wrote: float,
+        status: Status | None = None,
+        left_out: int = 0,
+    ) -> Plan:
         """What the core came to, or the error that it stands for."""
         solved = perf_counter()
         if wrong is not None:
             given.read()
             raise InvalidArgumentError(wrong, "is refused by the native core")
-        timing = Timing(0.0, wrote - began, solved - wrote, perf_counter() - began)
-        return NativePlan.of(self.core, given, timing)
+        timing = Timing(0.0, wrote - began, solved - wrote, solved - began)
+        return NativePlan.of(self.core, given, timing, status, left_out)
 
     def _write(
         self,
@@ -228,6 +270,7 @@ class NativeEngine:
     ) -> Given:
         """Write a step into the core's buffers."""
         model, N = self._problem.model, self._problem.horizon
+        known = self._write_obstacles(obstacles)  # first: where there is no room, the core changes
         inputs, views = self.core.inputs, self.core.views
         views["x0"][:] = as_array("x0", x0, (model.nx,))
         reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
@@ -241,7 +284,6 @@ class NativeEngine:
             shape = (model.dim, model.dim)
             uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
             views["robot_covariance"][:] = uncertain
-        known = self._write_obstacles(obstacles)
         u = None if u_last is None else views["u_last"].copy()
         x = views["x0"].copy(), views["x_ref"].copy()
         return Given(self._problem, *x, known, uncertain, self._nodes, u)
@@ -256,8 +298,9 @@ class NativeEngine:
         stacked = ObstaclePredictions.of(known, problem.horizon, model.dim, model.dt)
         shapes = stacked.shapes
         if shapes is not None and not self.core.has_room(shapes):
+            memory = self.core.memory
             self.core = NativeCore(*self._laid_out, room=shapes)
-            views = self.core.views
+            self.core.memory, views = memory, self.core.views
         views["means"][:J] = stacked.means
         views["covariances"][:J] = stacked.covariances
         views["radii"][:J] = stacked.radii
@@ -273,6 +316,7 @@ class NativeEngine:
             for name in ("states", "inputs", "s", "slack"):
                 parts[name][:] = getattr(plan, name)
             if duals is not None:
-                for name, values in zip(_DUALS, vars(duals).values(), strict=True):
-                    parts[name][:] = values if values.size else 0.0
+                for name, theirs in _DUALS.items():
+                    values = getattr(duals, name)
+                    parts[theirs][:] = values if values.size else 0.0
         return len(known)

@@ -68,6 +68,9 @@ class SCP:
         timer: Tells the time [s] to deadlines; None for the machine's clock.
         dt: Interval [s] of the loop that it works in, which is the deadline "dt"; None for none.
 
+    Attributes:
+        native: The native core, where `Settings(solver="native")` asks for it; else None.
+
     Raises:
         InvalidArgumentError: There is no solver of that name, or it is not installed.
         MissingCoreError: The native core is asked for, and not there.
@@ -89,8 +92,8 @@ class SCP:
         self._nodes = Nodes.of(problem)
         self._fallback = Fallback(problem, self.settings.tolerance)
         self._between = problem.nodes_per_interval > 1
-        self._native = self._engine() if self.settings.solver == "native" else None
-        if self._native is None:
+        self.native = self._engine() if self.settings.solver == "native" else None
+        if self.native is None:
             self._multi_start = MultiStart(self._at, self._loop)
         if self.settings.time_limit() is not None:
             self._warm_up()
@@ -114,12 +117,16 @@ class SCP:
 
     def __getstate__(self) -> dict[str, object]:
         """What a copy is built from: solvers and locks are not copied."""
-        parts = {"problem": self.problem, "settings": self.settings}
-        return parts | {"timer": self._timer, "dt": self._dt}
+        parts = {"problem": self.problem, "settings": self.settings, "timer": self._timer}
+        memory = None if self.native is None else self.native.core.memory
+        return parts | {"dt": self._dt, "memory": memory}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the copy."""
+        memory = state.pop("memory")
         self.__init__(**state)  # type: ignore[misc]
+        if self.native is not None:
+            self.native.core.memory = memory
 
     def solve(
         self,
@@ -175,8 +182,8 @@ class SCP:
         if not self._busy.acquire(blocking=False):
             raise ConcurrentUseError("this solver is at work in another thread; give each its own")
         try:
-            if self._native is not None:
-                return self._native.solve(
+            if self.native is not None:
+                return self.native.solve(
                     *(x0, x_ref, obstacles, nominal, multi_start, robot_covariance, u_last),
                     brake_first,
                 )
@@ -454,7 +461,7 @@ class SCP:
         slack = iterate.slack[: step.count]
         if step.nodes.count > 1:
             slack = frozen(step.nodes.stages(slack).max(axis=2, initial=0.0))
-        finished = self._at.finished if self._native is None else {}
+        finished = self._at.finished if self.native is None else {}
         return Plan(
             X=iterate.states,
             U=iterate.inputs,
