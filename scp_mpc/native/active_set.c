@@ -30,7 +30,7 @@ static const double CLEAN = 1e-2;      /* of the largest pivot: so much needs no
 static const double DEPENDENT = 1e-10; /* of the largest pivot: none */
 static const double NONE = 1e29;       /* a bound beyond this is none */
 static const double ROUNDING = 1e-12;  /* of a point that forces are to lead to */
-static const double NOISE = 1e-11;     /* of a force's change, rows being of length one: none */
+static const double NOISE = 1e-11;     /* of the largest change of a force: none */
 
 /* What all programs are solved in. */
 typedef struct {
@@ -599,6 +599,26 @@ static int pushing(const search *at, const double *point)
     return s->count > 0 && missed <= ACCURACY * size;
 }
 
+/* Those in `kept` are held, in their order; the others are not active any more. */
+static void hold_only(const search *at, int kept)
+{
+    storage *in = at->in;
+    solution *s = at->s;
+    memset(in->met, 0, (size_t)at->m);
+    for (int t = 0; t < kept; t++)
+        in->met[in->kept[t]] = 1;
+    s->count = 0;
+    for (int i = 0; i < at->m; i++) {
+        double wanted;
+        if (s->relaxed[i] || !s->active[i])
+            continue;
+        if (in->met[i] && extend(at, i, read_held(at, i, &wanted), 0))
+            in->wanted[s->count - 1] = wanted;
+        else
+            s->active[i] = 0;
+    }
+}
+
 /* Solve with a largest set of rows that do not depend on each other, without squaring them. At a
  * degenerate vertex many sets lead to the same point, but not all of them with forces that push;
  * non-negative least squares find one that does. */
@@ -634,19 +654,7 @@ static void independent(const search *at)
         kept = s->count;
         memcpy(in->kept, s->index, (size_t)kept * sizeof(int));
     }
-    memset(in->met, 0, (size_t)at->m);
-    for (int t = 0; t < kept; t++)
-        in->met[in->kept[t]] = 1;
-    s->count = 0;
-    for (int i = 0; i < at->m; i++) {
-        double wanted;
-        if (s->relaxed[i] || !s->active[i])
-            continue;
-        if (in->met[i] && extend(at, i, read_held(at, i, &wanted), 0))
-            in->wanted[s->count - 1] = wanted;
-        else
-            s->active[i] = 0;
-    }
+    hold_only(at, kept);
     memcpy(at->w, in->yielding, nv * sizeof(double));
     axpy(at->nv, 1, in->point, at->w);
     find_v(at);
