@@ -9,7 +9,7 @@
 enum {
     REPAIRS = 10,      /* of the bounds of a plan that ignores the obstacles */
     CHANGES = 100,     /* of the active set of a plan, before it is forgotten */
-    MOST_CHANGES = 400
+    MOST_CHANGES = 4000 /* where inputs saturate and obstacles yield, it is a simplex method */
 };
 static const double MOVED = 1e-6;     /* of a state: the robot is not where the guess has it */
 static const double ROUNDING = 1e-10; /* of a bounded entry, in its own unit */
