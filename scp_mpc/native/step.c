@@ -22,6 +22,7 @@ static const double SIGMAS = 3.0;    /* deviations that an obstacle's way may di
 static const double NONE = 1e30;     /* bounds that are none */
 static const double HARD = 10.0;     /* price of a hard state's excess in merits, times that of slack */
 static const double IMPOSSIBLE = 40.0; /* standard deviations beyond which Phi is zero in floats */
+static const double DOUBLE = -0.99;    /* in Cardano's formula: -1 where two eigenvalues are the same */
 static const double TURN = 6.283185307179586;
 
 typedef struct {
@@ -103,26 +104,52 @@ static int are_numbers(int count, const double *x)
     return !(wrong >> 63);
 }
 
-/* The largest variance in any direction; `least` is the smallest. */
-static inline double variances(const int d, const double *Sigma, double *least)
+/* The largest eigenvalue; in space by Cardano's formula, which loses half of the digits where the two
+ * largest are the same. */
+static inline double largest_eigenvalue(const int d, const double *S)
 {
     if (d == 2) {
-        double middle = (Sigma[0] + Sigma[3]) / 2, half = (Sigma[0] - Sigma[3]) / 2;
-        double away = sqrt(half * half + Sigma[2] * Sigma[2]);
-        *least = middle - away;
-        return middle + away;
+        double half = (S[0] - S[3]) / 2;
+        return (S[0] + S[3]) / 2 + sqrt(half * half + S[2] * S[2]);
     }
-    double values[3] = {Sigma[0], Sigma[4], Sigma[8]}, vectors[9];
-    if (Sigma[3] != 0 || Sigma[6] != 0 || Sigma[7] != 0)
-        eigen_small(3, Sigma, values, vectors);
-    *least = smallest(3, values);
-    return greatest(3, values);
+    double values[3] = {S[0], S[4], S[8]}, off = S[3] * S[3] + S[6] * S[6] + S[7] * S[7];
+    if (!(off > 0))
+        return greatest(3, values);
+    double mean = (S[0] + S[4] + S[8]) / 3, a = S[0] - mean, b = S[4] - mean, c = S[8] - mean;
+    double spread = sqrt((a * a + b * b + c * c + 2 * off) / 6);
+    double det = a * (b * c - S[7] * S[7]) - S[3] * (S[3] * c - S[7] * S[6]) +
+                 S[6] * (S[3] * S[7] - b * S[6]);
+    double r = det / (2 * spread * spread * spread);
+    if (r >= DOUBLE)
+        return mean + 2 * spread * cos(acos(lesser(r, 1.0)) / 3);
+    double vectors[9]; /* or no number: entries that are tiny */
+    eigen_small(3, S, values, vectors);
+    return values[2];
 }
 
 double largest_variance(int d, const double *Sigma)
 {
-    double least;
-    return variances(d, Sigma, &least);
+    return d == 2 ? largest_eigenvalue(2, Sigma) : largest_eigenvalue(3, Sigma);
+}
+
+/* Whether no eigenvalue is below -allowed: pivots of Sigma + allowed I. */
+static inline int is_semidefinite(const int d, const double *Sigma, double allowed)
+{
+    double A[9];
+    for (int k = 0; k < d * d; k++)
+        A[k] = Sigma[k] + (k % (d + 1) ? 0 : allowed);
+    for (int k = 0; k < d; k++) {
+        if (A[k * d + k] < 0)
+            return 0;
+        for (int i = k + 1; i < d; i++) {
+            double share = A[k * d + k] > 0 ? A[i * d + k] / A[k * d + k] : 0;
+            if (!(A[k * d + k] > 0) && A[i * d + k] != 0)
+                return 0;
+            for (int l = k + 1; l <= i; l++)
+                A[i * d + l] -= share * A[l * d + k];
+        }
+    }
+    return 1;
 }
 
 /* Whether matrices (count, d, d) are symmetric and positive semi-definite, up to rounding in a
@@ -130,18 +157,17 @@ double largest_variance(int d, const double *Sigma)
 static inline int are_covariances(const int d, int count, const double *Sigma, double *stds)
 {
     for (int i = 0; i < count; i++, Sigma += d * d) {
-        double most = 0, asymmetry = 0, least;
+        double most = 0, asymmetry = 0;
         for (int k = 0; k < d; k++)
             for (int l = 0; l <= k; l++) {
                 double one = Sigma[k * d + l], other = Sigma[l * d + k];
                 most = larger(larger(fabs(one), fabs(other)), most);
                 asymmetry = larger(fabs(one - other), asymmetry);
             }
-        double largest = variances(d, Sigma, &least);
-        if (asymmetry > ROUNDING * most || least < -ROUNDING * most)
+        if (asymmetry > ROUNDING * most || !is_semidefinite(d, Sigma, ROUNDING * most))
             return 0;
         if (stds)
-            stds[i] = sqrt(larger(largest, 0.0));
+            stds[i] = sqrt(larger(largest_eigenvalue(d, Sigma), 0.0));
     }
     return 1;
 }
@@ -257,28 +283,28 @@ static inline int counting(const predictions *given, int first, int i, int last)
     return first + (i > last && std[i] > std[last] ? last : i);
 }
 
-/* Covariance at a sample, with the robot's, and a bound of its variances behind it. */
-static inline void at_sample(const int d, const predictions *given, const double *robot, int row,
-                             int i, double *Sigma)
+/* Covariance at a sample, with the robot's; returns a bound of its variances. */
+static inline double at_sample(const int d, const predictions *given, const double *robot, int row,
+                               int i, double *Sigma)
 {
     double std = given->largest_std[row], trace = 0;
     for (int k = 0; k < d * d; k++)
         Sigma[k] = given->covariances[row * d * d + k] + (robot ? robot[i * d * d + k] : 0);
     for (int k = 0; robot && k < d; k++)
         trace += robot[i * d * d + k * (d + 1)];
-    Sigma[d * d] = std * std + trace;
+    return std * std + trace;
 }
 
-/* Values (width,) at the instants of an interval, linear between its ends, for each disc: for
- * covariances this errs on the safe side, if the obstacle moves in a straight line. */
-static inline double *interpolate(const int width, nodes of, const double *before,
-                                  const double *after, double *to)
+/* Values (width,) at the nodes of an interval, linear between its ends: for covariances this errs on
+ * the safe side, if the obstacle moves in a straight line. Returns where those of the next begin. */
+static inline double *interpolate(const int width, nodes of, const double *restrict before,
+                                  const double *restrict after, double *restrict to)
 {
     for (int k = 1; k <= of.K; k++) {
-        double share = (double)k / of.K;
-        for (int disc = 0; disc < of.n; disc++)
+        double share = (double)k / of.K, rest = 1 - share;
+        for (int disc = 0; disc < of.n; disc++, to += width)
             for (int l = 0; l < width; l++)
-                *to++ = (1 - share) * before[l] + share * after[l];
+                to[l] = rest * before[l] + share * after[l];
     }
     return to;
 }
@@ -287,8 +313,8 @@ static inline void spread_means(const int d, const predictions *given, nodes of,
 {
     for (int j = 0; j < given->J; j++) {
         const double *row = given->means + j * (of.N + 1) * d;
-        for (int l = 0; l < d; l++)
-            *to++ = row[l];
+        memcpy(to, row, (size_t)d * sizeof *to);
+        to += d;
         for (int i = 0; i < of.N; i++, row += d)
             to = interpolate(d, of, row, row + d, to);
     }
@@ -297,43 +323,62 @@ static inline void spread_means(const int d, const predictions *given, nodes of,
 static inline void spread_covariances(const int d, const predictions *given, nodes of,
                                       const double *robot, int last, double *to, double *std)
 {
-    enum { MOST = 3 * 3 + 1 };
-    double ends[2][MOST], between[MOST];
-    const int width = d * d + 1;
-    for (int j = 0; j < given->J; j++)
-        for (int i = 0; i <= of.N; i++) {
-            double *after = ends[i % 2], *before = ends[1 - i % 2];
-            int row = counting(given, j * (of.N + 1), i, last);
-            at_sample(d, given, robot, row, i, after);
-            for (int k = i ? 1 : of.K; k <= of.K; k++) {
-                double share = (double)k / of.K;
-                for (int l = 0; l < width; l++)
-                    between[l] = i ? (1 - share) * before[l] + share * after[l] : after[l];
-                double root = sqrt(between[d * d]);
-                for (int disc = i ? 0 : of.n - 1; disc < of.n; disc++, to += d * d) {
-                    memcpy(to, between, (size_t)(d * d) * sizeof *to);
-                    *std++ = root;
-                }
-            }
+    for (int j = 0, first = 0; j < given->J; j++, first += of.N + 1, std += of.size + 1) {
+        double ends[2][9], variances[2];
+        double *root = std + 1;
+        variances[0] = at_sample(d, given, robot, first, 0, ends[0]);
+        std[0] = variances[0];
+        memcpy(to, ends[0], (size_t)(d * d) * sizeof *to);
+        to += d * d;
+        for (int i = 0; i < of.N; i++) {
+            int now = i % 2, then = 1 - now, row = counting(given, first, i + 1, last);
+            variances[then] = at_sample(d, given, robot, row, i + 1, ends[then]);
+            to = interpolate(d * d, of, ends[now], ends[then], to);
+            root = interpolate(1, of, variances + now, variances + then, root);
         }
+        for (int i = 0; i <= of.size; i++)
+            std[i] = sqrt(std[i]);
+    }
 }
 
 /* Way of the obstacles between two instants: that of the mean, and three standard deviations of
  * what the covariance grows by. */
-static void spread_drift(int d, const predictions *given, nodes of, int last, double *drift)
+static inline void spread_drift(const int d, const predictions *given, nodes of, int last,
+                                double *drift)
 {
-    for (int j = 0; j < given->J; j++)
-        for (int i = 0; i < of.N; i++) {
-            int first = j * (of.N + 1);
-            const double *mean = given->means + (first + i) * d;
-            double before = given->largest_std[counting(given, first, i, last)], way[3];
-            double after = given->largest_std[counting(given, first, i + 1, last)];
-            double growth = sqrt(larger(after * after - before * before, 0.0));
+    for (int j = 0, first = 0; j < given->J; j++, first += of.N + 1) {
+        const double *mean = given->means + first * d;
+        double std = given->largest_std[first];
+        for (int i = 0; i < of.N; i++, mean += d) {
+            double then = given->largest_std[counting(given, first, i + 1, last)], way[3];
+            double grown = then * then - std * std;
             difference(d, mean + d, mean, way);
-            double sum = (sqrt(inner(d, way, way)) + SIGMAS * growth) / of.K;
+            double sum = sqrt(inner(d, way, way)) + (grown > 0 ? SIGMAS * sqrt(grown) : 0);
             for (int k = 0; k < of.count; k++)
-                *drift++ = sum;
+                *drift++ = sum / of.K;
+            std = then;
         }
+    }
+}
+
+/* All that lies between the samples. */
+static inline void spread(const int d, const predictions *given, const double *robot, int last,
+                          const step_room *room, step *to)
+{
+    const nodes of = room->nodes;
+    if (of.count > 1) {
+        spread_means(d, given, of, room->means);
+        to->means = room->means;
+    }
+    if (of.count > 1 || robot || last < of.N) {
+        spread_covariances(d, given, of, robot, last, room->covariances, room->largest_std);
+        to->bare = room->covariances;
+        to->bare_std = room->largest_std;
+    }
+    if (of.K > 1) {
+        spread_drift(d, given, of, last, room->drift);
+        to->drift = room->drift;
+    }
 }
 
 /* Covariances and deviations of nodes 1 .. C times sizes (J, C), or one for all. */
@@ -356,7 +401,7 @@ static void scale_covariances(int d, const double *sizes, double scale, nodes of
 void predict(const scp_core *core, const predictions *given, const double *robot_covariance,
              double scale, step_room *room, step *to)
 {
-    const int d = core->at.d, J = given->J, last = last_grown(core, room->nodes.N);
+    const int J = given->J, last = last_grown(core, room->nodes.N);
     const nodes of = room->nodes;
     memset(to, 0, sizeof *to);
     to->J = J;
@@ -365,28 +410,14 @@ void predict(const scp_core *core, const predictions *given, const double *robot
     to->means = given->means;
     to->bare = given->covariances;
     to->bare_std = given->largest_std;
-    if (of.count > 1) {
-        d == 2 ? spread_means(2, given, of, room->means) : spread_means(3, given, of, room->means);
-        to->means = room->means;
-    }
-    if (of.count > 1 || robot_covariance || last < of.N) {
-        if (d == 2)
-            spread_covariances(2, given, of, robot_covariance, last, room->covariances,
-                               room->largest_std);
-        else
-            spread_covariances(3, given, of, robot_covariance, last, room->covariances,
-                               room->largest_std);
-        to->bare = room->covariances;
-        to->bare_std = room->largest_std;
-    }
+    if (core->at.d == 2)
+        spread(2, given, robot_covariance, last, room, to);
+    else
+        spread(3, given, robot_covariance, last, room, to);
     to->covariances = to->bare;
     to->largest_std = to->bare_std;
     if (scale != 1)
-        scale_covariances(d, NULL, scale, of, room, to);
-    if (of.K > 1) {
-        spread_drift(d, given, of, last, room->drift);
-        to->drift = room->drift;
-    }
+        scale_covariances(core->at.d, NULL, scale, of, room, to);
     for (int j = 0; j < J; j++) {
         to->has_shapes |= given->shape[j] >= 0;
         for (int i = 0; i < of.size; i++)
