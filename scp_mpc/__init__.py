@@ -43,6 +43,7 @@ from scp_mpc.models import (
     Unicycle,
     lqr_weight,
 )
+from scp_mpc.native.export import export
 from scp_mpc.obstacles import (
     CircularObstacle,
     ConstantVelocityPredictor,
@@ -114,6 +115,7 @@ __all__ = [
     "Unicycle",
     "WindAwareMPC",
     "__version__",
+    "export",
     "lqr_weight",
     "shortest_path",
 ]

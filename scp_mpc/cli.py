@@ -1,12 +1,14 @@
-"""The command line: `scp-mpc report`, `coverage`, `replay`. The only file that prints."""
+"""The command line: `scp-mpc report`, `coverage`, `replay`, `export`. The only file that prints."""
 
 import json as json_format
+import runpy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 from scp_mpc import MPC, Containment, Margin, ScpMpcError, Settings, __version__
+from scp_mpc import export as write_export
 from scp_mpc.arrays import as_count
 from scp_mpc.errors import BoundsError, InvalidArgumentError
 from scp_mpc.problem import Problem
@@ -230,6 +232,32 @@ def replay(
             if animation:
                 written.append(write_replay_animation(run, out / "replay.gif"))
             typer.echo(f"Written to {out}: {', '.join(path.name for path in written)}")
+
+
+@app.command()
+def export(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A scenario of the report, scenario-1 to scenario-4, or a Python file that makes "
+            "a Problem of the name `problem` and perhaps Settings `settings`."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Directory for the package.")],
+    name: Annotated[str, typer.Option(help="Of the CMake package and its functions.")] = "robot",
+) -> None:
+    """Write a controller in C99 for one problem: sources, CMake files, example, test vectors."""
+    with _one_line_errors():
+        made: dict[str, Any] = {"settings": Settings()}
+        if source in SCENARIOS:
+            made["problem"] = SCENARIOS[source].problem()
+        else:
+            made |= runpy.run_path(source)
+        for kind in (Problem, Settings):
+            if not isinstance(made.get(kind.__name__.lower()), kind):
+                lacking = f"makes no `{kind.__name__.lower()}` that is a {kind.__name__}"
+                raise InvalidArgumentError("source", f"{source} {lacking}")
+        typer.echo(f"Written to {write_export(made['problem'], made['settings'], out, name)}")
 
 
 def _recording(file: Path, rate: float | None, layout: str | None) -> Recording:

@@ -120,7 +120,7 @@ def _stop(model: Any, name: str) -> Any:
         parts = [given] if isinstance(given, casadi.SX) else list(given)
         function = _function(name, [x], [casadi.vertcat(*parts)])
         same = all(
-            np.allclose(np.ravel(function(p)), model.stopping_input(p), _LIKE, _LIKE)
+            np.allclose(function(p).full()[:, 0], model.stopping_input(p), _LIKE, _LIKE)
             for p in points
         )
     except Exception as error:  # whatever a function of numbers does with a symbol

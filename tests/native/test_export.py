@@ -1,0 +1,259 @@
+"""The export: the same numbers, the same dynamics, and the same steps without Python."""
+
+import ctypes
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compiling import HERE, NEEDS_CORE, compiled, need, run
+
+from scp_mpc import (
+    CasadiModel,
+    DoubleIntegrator,
+    FunctionModel,
+    InvalidArgumentError,
+    JointRisk,
+    KinematicBicycle,
+    PlanarQuadrotor,
+    Problem,
+    Quadrotor,
+    Settings,
+    Unicycle,
+    export,
+)
+from scp_mpc.models.generated import generated
+from scp_mpc.native.constants import constants
+from scp_mpc.native.library import Dynamics, ProblemStruct
+
+SETTINGS = Settings(tolerance=1e-7, deadline=0.05)
+
+
+def drag(**how):
+    casadi = pytest.importorskip("casadi")
+    x, u = casadi.SX.sym("x", 4), casadi.SX.sym("u", 2)
+    speed = casadi.sqrt(x[2] ** 2 + x[3] ** 2 + 0.01)
+    rates = casadi.vertcat(x[2:], u - 0.3 * speed * x[2:])
+    given = {"dt": 0.2, "position": [0, 1], "velocity": [2, 3], "substeps": 2}
+    return CasadiModel(rates, x, u, **given | how)
+
+
+def discrete():
+    casadi = pytest.importorskip("casadi")
+    x, u = casadi.SX.sym("x", 5), casadi.SX.sym("u", 2)
+    nose = casadi.vertcat(casadi.cos(x[2]), casadi.sin(x[2]))
+    after = casadi.vertcat(x[:2] + 0.2 * x[3] * nose, x[2] + 0.2 * x[4], x[3:] + 0.2 * u)
+    return CasadiModel(after, x, u, dt=0.2, position=[0, 1], heading=2, discrete=True)
+
+
+def problem(model, **how):
+    given = {"horizon": 6, "Q": np.full(model.nx, 0.1), "R": np.full(model.nu, 0.01)}
+    half = 3.0 + 0.0 * model.equilibrium_input
+    given |= {"u_min": model.equilibrium_input - half, "u_max": model.equilibrium_input + half}
+    return Problem(model, **given | {"robot_radius": 0.15, "max_obstacles": 3} | how)
+
+
+PROBLEMS = {
+    "double": lambda: problem(DoubleIntegrator(0.2), du_max=1.0, x_max=[9, 1.5, 9, 1.5]),
+    "space": lambda: problem(DoubleIntegrator(0.2, dim=3), margin=JointRisk(0.05)),
+    "alone": lambda: problem(DoubleIntegrator(0.2), max_obstacles=0, nodes_per_interval=1),
+    "unicycle": lambda: problem(Unicycle(0.1), discs=[-0.2, 0.2], speed_max=1.0),
+    "bicycle": lambda: problem(KinematicBicycle(0.1, 1.0), inflation="axes"),
+    "planar": lambda: problem(PlanarQuadrotor(0.1)),
+    "drag": lambda: problem(drag()),
+}
+OWN = {"planar", "drag"}
+
+
+@NEEDS_CORE
+@pytest.mark.parametrize("name", sorted(set(PROBLEMS) - OWN))
+def test_numbers_read_back_as_the_same_bits(name, tmp_path):
+    given = PROBLEMS[name]()
+    export(given, SETTINGS, tmp_path, name="this_one")
+    source = tmp_path / "src" / "this_one.c"
+    library = ctypes.CDLL(str(compiled(tmp_path / "x.so", source, flags=[f"-I{tmp_path}/include"])))
+    struct = ProblemStruct()
+    library.this_one_problem(ctypes.byref(struct))
+    expected = constants(given, SETTINGS, 0.05)
+    for member, _ in ProblemStruct._fields_:
+        found, value = getattr(struct, member), expected.get(member, 0)
+        if isinstance(value, np.ndarray) and value.size:
+            view = np.ctypeslib.as_array(found, value.shape)
+            assert view.tobytes() == np.ascontiguousarray(value).tobytes(), member
+        elif not isinstance(value, np.ndarray) and member in expected:
+            assert found == value, member
+        else:
+            assert not found or member == "own", member
+    assert not ctypes.cast(struct.own.advance, ctypes.c_void_p).value
+
+
+def dynamics(model, tmp_path):
+    """`scp_dynamics` of a model's generated C."""
+    from scp_mpc.native.export import _model  # a problem's file, without a core
+
+    source = tmp_path / "model.c"
+    source.write_text(_model(model, "my_robot"))
+    library = ctypes.CDLL(str(compiled(tmp_path / "m.so", source)))
+    return Dynamics.in_dll(library, "my_robot_dynamics"), library
+
+
+MODELS = {
+    "planar": lambda: PlanarQuadrotor(0.2, substeps=2),
+    "quadrotor": lambda: Quadrotor(0.2),
+    "drag": drag,
+    "discrete": discrete,
+    "stops": lambda: drag(stopping_input=lambda x: -x[2:] / 0.2),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_generated_dynamics_are_those_of_the_model(name, tmp_path):
+    pytest.importorskip("casadi")
+    model = MODELS[name]()
+    own, _library = dynamics(model, tmp_path)
+    stop = np.empty(model.nu)
+    for state in 0.5 * np.random.default_rng(1).normal(size=(20, model.nx)):
+        assert own.stopping_input(None, state.ctypes.data, stop.ctypes.data) == 0
+        np.testing.assert_allclose(stop, model.stopping_input(state), rtol=1e-9, atol=1e-9)
+    for share in (1.0, 0.25):
+        compare(model, own, share)
+
+
+def compare(model, own, share):
+    rng, count, nx, nu = np.random.default_rng(0), 5, model.nx, model.nu
+    x = 0.5 * rng.normal(size=(count, nx))
+    u = model.equilibrium_input + rng.normal(size=(count, nu))
+    y = rng.normal(size=(count, nx))
+    y[3] = 0.0
+    after, A, B = (np.empty((count, nx, *width)) for width in ((), (nx,), (nu,)))
+    bent = np.empty((count, nx + nu, nx + nu))
+    at = [array.ctypes.data for array in (x, u)]
+    expected = model.linearise(x, u, share)
+    assert own.advance(None, count, *at, share, after.ctypes.data) == 0
+    np.testing.assert_allclose(after, expected.after, rtol=1e-13, atol=1e-13)
+    after[:] = 0
+    places = [array.ctypes.data for array in (after, A, B)]
+    assert own.linearise(None, count, *at, share, *places) == 0
+    for found, wanted in (after, expected.after), (A, expected.A), (B, expected.B):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+    assert own.curvature(None, count, *at, y.ctypes.data, share, bent.ctypes.data) == 0
+    wanted = model.curvature(x, u, y, share)
+    np.testing.assert_allclose(bent, wanted, rtol=1e-10, atol=1e-10)
+
+
+def test_what_is_python_is_refused(tmp_path):
+    pytest.importorskip("casadi")
+    rates = lambda x, u: np.array([x[2], x[3], u[0], u[1]])  # noqa: E731
+    model = FunctionModel(rates, nx=4, nu=2, dt=0.2, position=[0, 1])
+    with pytest.raises(
+        InvalidArgumentError, match=r"model: FunctionModel is Python: .*CasadiModel"
+    ):
+        export(problem(model), Settings(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+    class Other(Unicycle):
+        """May have another f."""
+
+    with pytest.raises(InvalidArgumentError, match="Other is Python"):
+        generated(Other(0.1), "x")
+    for stops, words in (
+        (lambda x: np.array([-x.max(), 0.0]), "takes no CasADi symbol"),
+        (lambda x: x[2:] if isinstance(x, np.ndarray) else -x[2:], "is another one"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=f"stopping_input: {words}"):
+            generated(drag(stopping_input=stops), "x")
+    with pytest.raises(InvalidArgumentError, match="name: 'My Robot' is no name"):
+        export(problem(Unicycle(0.1)), Settings(), tmp_path / "new", name="My Robot")
+
+
+CPP = """
+#include <cstdio>
+#include <cstdlib>
+#include <robot.h>
+
+int main()
+{
+    scp_problem problem;
+    robot_problem(&problem);
+    std::size_t size = scp_size(&problem);
+    void *block = std::aligned_alloc(64, (size + 63) / 64 * 64);
+    scp_core *core = scp_setup(&problem, block, size);
+    scp_in(core)->x_ref[problem.horizon * problem.nx] = 1.0;
+    int wrong = scp_step(core);
+    std::printf("%d %d %zu %.17g\\n", wrong, scp_out(core)->status, size, scp_out(core)->u0[0]);
+    std::free(block);
+    return wrong;
+}
+"""
+CPP_LISTS = """
+cmake_minimum_required(VERSION 3.16)
+project(user LANGUAGES CXX)
+find_package(robot 0.1 CONFIG REQUIRED)
+add_executable(user user.cpp)
+target_link_libraries(user PRIVATE robot::robot)
+"""
+
+
+def built(source, build, *options):
+    run("cmake", "-S", source, "-B", build, *options)
+    run("cmake", "--build", build)
+
+
+@pytest.mark.slow
+@NEEDS_CORE
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_package_builds_replays_and_is_found(name, tmp_path):
+    need("cmake", "c++")
+    source, build, user = tmp_path / "export", tmp_path / "build", tmp_path / "user"
+    export(PROBLEMS[name](), SETTINGS, source)
+    built(source, build, f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'installed'}")
+    told = run(build / "replay", *([] if name in OWN else ["--bits"]))
+    assert re.match(r"12 steps, \d+ the same bit by bit, at most \S+ apart", told)
+    run("ctest", "--test-dir", build)
+    assert len(run(build / "example").splitlines()) == 50
+    run("cmake", "--install", build)
+    user.mkdir()
+    (user / "user.cpp").write_text(CPP)
+    (user / "CMakeLists.txt").write_text(CPP_LISTS)
+    built(user, user / "build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'installed'}")
+    wrong, status, size, _ = run(user / "build" / "user").split()
+    header = (source / "include" / "robot.h").read_text()
+    assert (wrong, status) == ("0", "0")
+    assert int(re.search(r"ROBOT_BYTES = (\d+)", header)[1]) == int(size)
+
+
+@pytest.mark.slow
+@NEEDS_CORE
+@pytest.mark.parametrize("name", ["double", "unicycle", "bicycle", "drag"])
+def test_another_machine_replays_the_same_steps(name, tmp_path):
+    """aarch64, by `apt install gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static`."""
+    need("cmake", "aarch64-linux-gnu-gcc", "qemu-aarch64-static")
+    export(PROBLEMS[name](), SETTINGS, tmp_path / "export")
+    built(
+        *(tmp_path / "export", tmp_path / "build", "-DCMAKE_SYSTEM_NAME=Linux"),
+        *("-DCMAKE_SYSTEM_PROCESSOR=aarch64", "-DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc"),
+        "-DCMAKE_CROSSCOMPILING_EMULATOR=qemu-aarch64-static;-L;/usr/aarch64-linux-gnu",
+    )
+    run("ctest", "--test-dir", tmp_path / "build", "--output-on-failure")
+    machine = (
+        run("file", "-b", tmp_path / "build" / "replay") if Path("/usr/bin/file").exists() else ""
+    )
+    assert not machine or "aarch64" in machine
+
+
+@NEEDS_CORE
+@pytest.mark.parametrize("obstacles", [1, 12])
+def test_memory_is_small(obstacles):
+    from scp_mpc.native.core import NativeCore
+
+    this = problem(
+        DoubleIntegrator(0.2), horizon=30, max_obstacles=obstacles, margin=JointRisk(0.05)
+    )
+    assert NativeCore(this, Settings()).bytes < 2e6
+
+
+def test_sources_are_those_that_exist():
+    """What is exported includes no header that is not."""
+    for path in HERE.glob("*.[ch]"):
+        for header in re.findall(r'#include "(.*)"', path.read_text()):
+            assert (HERE / header).exists(), header
