@@ -20,8 +20,9 @@
 
 #include "core.h"
 
-static const double ACCURACY = 1e-9;   /* of a constraint, in its own unit */
-static const double HELD = 1e-8;       /* the same at the end, after the last system */
+static const double ACCURACY = 1e-9;   /* of a constraint, in its own unit; */
+static const double FINE = 0.1;        /* or this share of the tolerance, if that is less */
+static const double HELD = 10;         /* times that at the end, after the last system */
 static const double LEAST = 1e-30;     /* of what forces ask: so little pull is none */
 static const double SHARE = 0.5;       /* of the worst: who is no better goes along */
 static const double PULL = 1e-10;      /* of the largest force: a pull that is none */
@@ -226,9 +227,14 @@ static int holds_to(scp_core *core, const qp *of, const solution *s, double tole
     return 1;
 }
 
+static double accuracy(const scp_core *core)
+{
+    return fmin(ACCURACY, FINE * core->p.tolerance);
+}
+
 int holds(scp_core *core, const qp *of, const solution *s)
 {
-    return holds_to(core, of, s, ACCURACY);
+    return holds_to(core, of, s, accuracy(core));
 }
 
 /* ---- rows and their factor */
@@ -880,7 +886,7 @@ static qp_end finish(scp_core *core, const search *at, int systems)
             wrong = fmax(wrong, fabs(s->force[i])); /* rounding, or the vertex is degenerate */
             s->force[i] = 0;
         }
-    if (wrong > PULL * largest_force(at) || (systems > 1 && !holds_to(core, at->of, s, HELD)))
+    if (wrong > PULL * largest_force(at) || (systems > 1 && !holds_to(core, at->of, s, HELD * accuracy(core))))
         return QP_UNSOLVED;
     return unpack(at) ? QP_SOLVED : QP_UNSOLVED;
 }
@@ -907,7 +913,7 @@ qp_end settle(scp_core *core, const qp *of, solution *s, int most, double limit,
             return QP_UNSOLVED;
         if (dual > limit)
             return QP_CUT;
-        if (deepest <= ACCURACY)
+        if (deepest <= accuracy(core))
             return finish(core, &at, *systems);
         if (!s->relaxed[p])
             s->active[p] = (int8_t)side;
