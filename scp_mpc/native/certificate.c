@@ -303,9 +303,10 @@ static double smallest_few(scp_core *core, int nv, int q, const double *factors,
     return (1 + least) / larger(1, -least - 1);
 }
 
-/* Of M (nv, nv), which is lost, across a basis; directions that are gone bend up. */
+/* Of M (nv, nv), which is lost, across a basis; its largest counts as no less than `over`, and
+ * directions that are gone bend up by that much. */
 static double smallest_of(scp_core *core, int nv, double *M, int rank, const double *basis,
-                          double *direction)
+                          double over, double *direction)
 {
     arena *room = &core->scratch;
     double least, most;
@@ -322,14 +323,14 @@ static double smallest_of(scp_core *core, int nv, double *M, int rank, const dou
                 axpy(nv, -basis[r * nv + i], Z + r * nv, M + i * nv);
                 axpy(nv, -Z[r * nv + i], basis + r * nv, M + i * nv);
             }
-        double up = largest_abs(nv * nv, M);
+        double up = larger(over, largest_abs(nv * nv, M));
         for (int r = 0; r < rank; r++)
             for (int i = 0; i < nv; i++)
                 axpy(nv, up * basis[r * nv + i], basis + r * nv, M + i * nv);
     }
     if (eigen_least(nv, M, &least, &most, direction, room))
         return (double)NAN;
-    return least / larger(LEAST, most);
+    return least / larger(over, most);
 }
 
 /* Smallest eigenvalue on the null space of the rows (k, nv) that are `kept`, over the largest, and
@@ -360,7 +361,7 @@ static double smallest(scp_core *core, int nv, const double *W, int q, const dou
                 axpy(nv, -factors[i * nv + r], factors + i * nv, M + r * nv);
         for (int r = 0; r < nv; r++)
             M[r * nv + r] += 1;
-        least = smallest_of(core, nv, M, rank, basis, direction);
+        least = smallest_of(core, nv, M, rank, basis, W ? LEAST : 1, direction);
     }
     room->used = used;
     return least;

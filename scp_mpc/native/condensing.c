@@ -55,6 +55,7 @@ void lay_out_sensitivity(const scp_core *core, arena *from, sensitivity *by)
     size_t N = (size_t)core->at.N, nx = (size_t)core->at.nx, nu = (size_t)core->at.nu;
     by->K = doubles(from, N * nu * nx);
     by->T = doubles(from, N * nu * nu);
+    by->A = doubles(from, N * nx * nx);
     by->E = doubles(from, N * nx * N * nu);
     by->S = doubles(from, (size_t)core->at.ny * (size_t)core->at.nv);
 }
@@ -430,114 +431,99 @@ static int riccati(scp_core *core, const double *A, const double *B, double *K, 
 
 /* ---- responses */
 
-/* Rows y (m, w) = M X for rows X (k, w) that are `x_apart` and `y_apart`; M has few entries. */
-static void combine(int m, int k, int w, const double *M, const double *X, int x_apart, double *y,
-                    int y_apart)
+/* y (w,) += sum of k rows, `apart`, times coefficients, `stride`: four at a time */
+static void sum_rows(int k, int w, const double *c, int stride, const double *X, int apart,
+                     double *restrict y)
 {
-    for (int i = 0; i < m; i++, M += k, y += y_apart) {
-        memset(y, 0, (size_t)w * sizeof(double));
-        for (int j = 0; j < k; j++)
-            if (M[j] != 0)
-                axpy(w, M[j], X + j * x_apart, y);
+    for (; k >= 4; k -= 4, c += 4 * stride, X += 4 * apart) {
+        const double *x1 = X + apart, *x2 = x1 + apart, *x3 = x2 + apart;
+        double c0 = c[0], c1 = c[stride], c2 = c[2 * stride], c3 = c[3 * stride];
+        for (int l = 0; l < w; l++)
+            y[l] += (c0 * X[l] + c1 * x1[l]) + (c2 * x2[l] + c3 * x3[l]);
     }
+    for (; k > 0; k--, c += stride, X += apart)
+        axpy(w, c[0], X, y);
 }
 
-/* Likewise for full M: four rows at a time. */
-static void combine_full(int m, int k, int w, const double *M, const double *X, int x_apart,
-                         double *y, int y_apart)
+/* Likewise, of few that are not zero. */
+static void sum_some(int k, int w, const double *c, const double *X, int apart, double *y)
 {
-    for (int i = 0; i < m; i++, M += k, y += y_apart) {
-        double *restrict row = y;
-        memset(row, 0, (size_t)w * sizeof(double));
-        int j = 0;
-        for (; j + 4 <= k; j += 4) {
-            const double *x0 = X + j * x_apart, *x1 = x0 + x_apart, *x2 = x1 + x_apart;
-            const double *x3 = x2 + x_apart;
-            double m0 = M[j], m1 = M[j + 1], m2 = M[j + 2], m3 = M[j + 3];
-            for (int c = 0; c < w; c++)
-                row[c] += (m0 * x0[c] + m1 * x1[c]) + (m2 * x2[c] + m3 * x3[c]);
-        }
-        for (; j < k; j++)
-            axpy(w, M[j], X + j * x_apart, row);
-    }
+    for (int j = 0; j < k; j++)
+        if (c[j] != 0)
+            axpy(w, c[j], X + j * apart, y);
 }
 
-/* E, and rows u of S: e_i <- (A - B K) e_before + B T'v_i, u_i = T'v_i - K e_before. */
-static void respond_states(scp_core *core, const derivatives *D, sensitivity *by)
+/* The closed loop A - B K, E, and rows u of S:
+ *     e_i = (A - B K) e_before + B T'v_i,    u_i = T'v_i - K e_before */
+static void respond_states(const scp_core *core, const derivatives *D, sensitivity *by)
 {
     const layout *at = &core->at;
     int nx = at->nx, nu = at->nu, n = at->n, nv = at->nv;
-    size_t used = core->scratch.used;
-    double *closed = doubles(&core->scratch, (size_t)(nx * nx));
-    double *gain = doubles(&core->scratch, (size_t)(nu * nx));
     for (int i = 0; i < at->N; i++) {
-        const double *A = D->A + i * nx * nx, *B = D->B + i * nx * nu, *T = by->T + i * nu * nu;
-        double *E = by->E + i * nx * n, *U = by->S + (at->u + i * nu) * nv;
+        const double *B = D->B + i * nx * nu, *K = by->K + i * nu * nx, *T = by->T + i * nu * nu;
+        double *closed = by->A + i * nx * nx, *E = by->E + i * nx * n, *before = E - nx * n;
+        double *U = by->S + (at->u + i * nu) * nv;
         int w = i * nu;
-        for (int k = 0; k < nu * nx; k++)
-            gain[k] = -by->K[i * nu * nx + k];
-        copy(nx * nx, A, closed);
-        for (int r = 0; r < nx; r++)
-            add_t(nu, nx, gain, B + r * nu, closed + r * nx);
-        if (i) {
-            combine_full(nx, nx, w, closed, E - nx * n, n, E, n);
-            combine_full(nu, nx, w, gain, E - nx * n, n, U, nv);
-        }
-        for (int c = 0; c < nu; c++)
-            for (int r = 0; r < nu; r++)
+        for (int r = 0; r < nu; r++) {
+            memset(U + r * nv, 0, (size_t)nv * sizeof(double));
+            if (i)
+                sum_rows(nx, w, K + r * nx, 1, before, n, U + r * nv);
+            scale(w, -1, U + r * nv);
+            for (int c = r; c < nu; c++)
                 U[r * nv + w + c] = T[c * nu + r];
-        for (int r = 0; r < nx; r++)
-            for (int c = 0; c < nu; c++) {
-                double sum = 0;
-                for (int k = c; k >= 0; k--)
-                    sum += B[r * nu + k] * T[c * nu + k];
-                E[r * n + w + c] = sum;
+        }
+        for (int r = 0; r < nx; r++) {
+            for (int c = 0; c < nx; c++) {
+                closed[r * nx + c] = D->A[(i * nx + r) * nx + c];
+                for (int k = 0; k < nu; k++)
+                    closed[r * nx + c] -= B[r * nu + k] * K[k * nx + c];
             }
-        for (int r = 0; r < nx; r++)
-            memset(E + r * n + w + nu, 0, (size_t)(n - w - nu) * sizeof(double));
+            memset(E + r * n, 0, (size_t)n * sizeof(double));
+            if (i)
+                sum_rows(nx, w, closed + r * nx, 1, before, n, E + r * n);
+            for (int c = 0; c < nu; c++)
+                E[r * n + w + c] = dot(c + 1, B + r * nu, T + c * nu);
+        }
     }
-    core->scratch.used = used;
 }
 
-/* Rows of S for positions, changes and bounded states, as far as they reach. */
+/* Rows of S for positions, changes and bounded states. */
 static void respond_outputs(const scp_core *core, const derivatives *D, sensitivity *by)
 {
     const layout *at = &core->at;
     int nx = at->nx, nu = at->nu, n = at->n, nv = at->nv, m = between(core);
-    int part = at->nodes.n * at->d, rows = m + part;
+    int part = at->nodes.n * at->d;
+    double *p = by->S + at->p * nv, *du = by->S + at->du * nv, *z = by->S + at->z * nv;
+    memset(p, 0, (size_t)at->u * (size_t)nv * sizeof(double)); /* and rows of sizes */
+    memset(du, 0, (size_t)(at->ny - at->du) * (size_t)nv * sizeof(double));
     for (int i = 0; i < at->N; i++) {
-        const double *before = by->E + (i - 1) * nx * n, *E = by->E + i * nx * n;
-        const double *U = by->S + (at->u + i * nu) * nv;
-        double *p = by->S + (at->p + i * rows) * nv;
+        const double *E = by->E + i * nx * n, *U = by->S + (at->u + i * nu) * nv;
         int w = (i + 1) * nu;
-        combine(m, nu, w, D->D + i * m * nu, U, nv, p, nv);
-        for (int r = 0; i && r < m; r++)
-            for (int k = 0; k < nx; k++)
-                if (D->C[(i * m + r) * nx + k] != 0)
-                    axpy(w - nu, D->C[(i * m + r) * nx + k], before + k * n, p + r * nv);
-        combine(part, nx, w, D->at + i * part * nx, E, n, p + m * nv, nv);
-        combine(at->nb, nx, w, core->p.row, E, n, by->S + (at->z + i * at->nb) * nv, nv);
-        for (int k = 0; at->rated && k < nu; k++) {
-            double *du = by->S + (at->du + i * nu + k) * nv;
+        for (int r = 0; r < m; r++, p += nv) {
+            if (i)
+                sum_some(nx, w - nu, D->C + (i * m + r) * nx, E - nx * n, n, p);
+            sum_some(nu, w, D->D + (i * m + r) * nu, U, nv, p);
+        }
+        for (int r = 0; r < part; r++, p += nv)
+            sum_some(nx, w, D->at + (i * part + r) * nx, E, n, p);
+        for (int r = 0; r < at->nb; r++, z += nv)
+            sum_some(nx, w, core->p.row + r * nx, E, n, z);
+        for (int k = 0; at->rated && k < nu; k++, du += nv) {
             copy(w, U + k * nv, du);
             if (i)
                 axpy(w - nu, -1, U + (k - nu) * nv, du);
         }
     }
+    for (int j = 0; j < at->moving; j++)
+        by->S[(at->s + j) * nv + n + j] = 1 / sqrt(2 * core->p.s_weight);
 }
 
 static int sensitivity_along(scp_core *core, const derivatives *D, sensitivity *by)
 {
-    const layout *at = &core->at;
     if (riccati(core, D->A, D->B, by->K, by->T, NULL))
         return 1;
     respond_states(core, D, by);
     respond_outputs(core, D, by);
-    for (int r = 0; r < at->ny; r++)
-        memset(by->S + r * at->nv + core->reach[r], 0,
-               (size_t)(at->nv - core->reach[r]) * sizeof(double));
-    for (int j = 0; j < at->moving; j++)
-        by->S[(at->s + j) * at->nv + at->n + j] = 1 / sqrt(2 * core->p.s_weight);
     return 0;
 }
 
@@ -563,37 +549,49 @@ static void respond(const scp_core *core, const derivatives *D, const sensitivit
     }
 }
 
+/* Backwards through the closed loop: with F_x and F_u the gradients of all columns' stages in e and
+ * u, and `later` those of all that comes after in e_i,
+ *     rows v_i = T F_u + T B'later,    later <- F_x - K'F_u + (A - B K)'later */
 void curvature_in_v(scp_core *core, const sensitivity *by, const double *stages, const double *sway,
                     double *W)
 {
     const layout *at = &core->at;
-    int nx = at->nx, nu = at->nu, n = at->n, nv = at->nv, size = nx + nu;
-    size_t used = core->scratch.used;
-    double *bent = doubles(&core->scratch, (size_t)n);
+    int N = at->N, nx = at->nx, nu = at->nu, n = at->n, nv = at->nv, size = nx + nu;
+    size_t used = core->scratch.used, block = (size_t)(nx * n);
+    double *later = doubles(&core->scratch, block), *sooner = doubles(&core->scratch, block);
+    double *F = doubles(&core->scratch, (size_t)(size * n)), *F_u = F + nx * n;
+    memset(later, 0, block * sizeof(double));
     memset(W, 0, (size_t)nv * (size_t)nv * sizeof(double));
-    for (int i = 0; i < at->N; i++, stages += size * size) {
-        const double *E = by->E + i * nx * n, *U = by->S + (at->u + i * nu) * nv;
-        int w = (i + 1) * nu;
-        for (int a = i ? 0 : nx; a < size; a++) { /* W += m_a' (sum_b H_ab m_b) */
-            const double *row = a < nx ? E + (a - nx) * n : U + (a - nx) * nv, *H = stages + a * size;
-            int bends = 0;
-            memset(bent, 0, (size_t)w * sizeof(double));
-            for (int b = i ? 0 : nx; b < size; b++)
-                if (H[b] != 0) {
-                    axpy(b < nx ? w - nu : w, H[b], b < nx ? E + (b - nx) * n : U + (b - nx) * nv,
-                         bent);
-                    bends = 1;
-                }
-            for (int r = 0; bends && r < (a < nx ? w - nu : w); r++)
-                axpy(r + 1, row[r], bent, W + r * nv);
+    for (int i = N - 1; i >= 0; i--) {
+        const double *H = stages + i * size * size, *K = by->K + i * nu * nx;
+        const double *T = by->T + i * nu * nu, *E = by->E + i * nx * n, *before = E - nx * n;
+        const double *U = by->S + (at->u + i * nu) * nv;
+        int w = (i + 1) * nu, heading = core->p.heading;
+        if (sway)
+            axpy(w, sway[i], E + heading * n, later + heading * n);
+        memset(F, 0, (size_t)(size * n) * sizeof(double));
+        for (int r = i ? 0 : nx; r < size; r++) {
+            if (i)
+                sum_some(nx, w - nu, H + r * size, before, n, F + r * n);
+            sum_some(nu, w, H + r * size + nx, U, nv, F + r * n);
         }
-        const double *turn = E + core->p.heading * n;
-        for (int r = 0; sway && sway[i] != 0 && r < w; r++)
-            axpy(r + 1, sway[i] * turn[r], turn, W + r * nv);
+        for (int k = 0; k < nu; k++) {
+            double *row = W + (i * nu + k) * nv;
+            sum_rows(k + 1, w, T + k * nu, 1, F_u, n, row);
+            sum_rows(nx, w, E + i * nu + k, n, later, n, row);
+            for (int c = 0; c < i * nu + k; c++)
+                W[c * nv + i * nu + k] = row[c];
+        }
+        scale(nu * n, -1, F_u);
+        for (int c = 0; i && c < nx; c++) {
+            double *row = sooner + c * n;
+            copy(w - nu, F + c * n, row);
+            sum_rows(nu, w - nu, K + c, nx, F_u, n, row);
+            sum_rows(nx, w - nu, by->A + i * nx * nx + c, nx, later, n, row);
+        }
+        double *swap = later;
+        later = sooner, sooner = swap;
     }
-    for (int r = 0; r < n; r++)
-        for (int c = 0; c < r; c++)
-            W[c * nv + r] = W[r * nv + c];
     core->scratch.used = used;
 }
 
@@ -886,6 +884,8 @@ size_t scratch_of_condensing(const scp_core *core)
     int nx = at->nx, nu = at->nu, states = at->N * nx, takes = 20;
     int most = states * (2 * nx + 2 * nu + 2) + at->n * (nu + 2) + 2 * nx;
     int plan = (at->N + 1) * nx + states + at->nodes.size * at->d + 2 * at->n + at->M;
-    most = (most > plan ? most : plan) + 2 * nx * nx + 4 * nx * nu + nu * nu + 3 * nx + 2 * nu;
+    int bent = (3 * nx + nu) * at->n;
+    most = most > plan ? most : plan;
+    most = (most > bent ? most : bent) + 2 * nx * nx + 4 * nx * nu + nu * nu + 3 * nx + 2 * nu;
     return ((size_t)most + 8 * (size_t)takes) * sizeof(double);
 }
