@@ -11,7 +11,7 @@ import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -47,28 +47,26 @@ class IterateLayout:
     """Where the arrays of a `scp_iterate` are, in doubles from the first of them.
 
     Attributes:
-        places: Where each begins, and its shape, by name.
+        places: Where each begins and ends, and its shape, by name.
         size: To the end of the last one.
     """
 
-    places: dict[str, tuple[int, tuple[int, ...]]]
+    places: dict[str, tuple[int, int, tuple[int, ...]]]
     size: int
 
     @classmethod
     def of(cls, struct: IterateStruct, shapes: dict[str, tuple[int, ...]]) -> "IterateLayout":
         """Read the addresses: the states come first."""
-        there = {name: _address(getattr(struct, name)) for name in shapes}
-        first = there["states"]
-        places = {
-            name: ((there[name] - first) // 8 if np.prod(shape) else 0, shape)
-            for name, shape in shapes.items()
-        }
-        assert min(at for at, _ in places.values()) == 0
-        return cls(places, max(at + int(np.prod(shape)) for at, shape in places.values()))
+        first, places = _address(struct.states), {}
+        for name, shape in shapes.items():
+            size = prod(shape)
+            at = (_address(getattr(struct, name)) - first) // 8 if size else 0
+            places[name] = at, at + size, shape
+        assert min(at for at, _, _ in places.values()) == 0
+        return cls(places, max(end for _, end, _ in places.values()))
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """What a step of the core came to, copied out of it.
 
     Attributes:
@@ -90,8 +88,8 @@ class Outcome:
 
     def part(self, numbers: FloatArray, name: str) -> FloatArray:
         """One of the arrays within all of the numbers of a plan."""
-        at, shape = self.layout.places[name]
-        return numbers[at : at + prod(shape)].reshape(shape)
+        at, end, shape = self.layout.places[name]
+        return numbers[at:end].reshape(shape)
 
     def iterate(self, which: str) -> tuple[bool, dict[str, FloatArray]]:
         """Whether the "plan" or the "obstacle_free" one has multipliers; its arrays by name."""
@@ -219,8 +217,12 @@ class NativeCore:
         solids = [solid for solid in shapes if solid is not None]
         return all(len(getattr(s, part)) <= self._room[n] for n, part in _PARTS for s in solids)
 
-    def set_shapes(self, shapes: Sequence[Solid | None]) -> None:
-        """Say which obstacles are polytopes, and write them if any is new."""
+    def set_shapes(self, shapes: Sequence[Solid | None] | None) -> None:
+        """Say which obstacles are polytopes, and write them if any is new; None: all are round."""
+        if shapes is None:
+            if self._solids:
+                self._solids, self.inputs.shapes, self.views["shape"][:] = [], 0, -1
+            return
         solids = list({id(s): s for s in shapes if s is not None}.values())
         number = {id(solid): k for k, solid in enumerate(self._solids)}
         if any(id(solid) not in number for solid in solids):

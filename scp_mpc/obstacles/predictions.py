@@ -200,14 +200,13 @@ def _each(argument: str, values: Sequence[Any], count: int) -> tuple[Any, ...]:
 
 
 def _is_surely_positive(Sigma: FloatArray) -> bool:
-    """Whether finite matrices (..., d, d) are symmetric and positive semi-definite, or perhaps.
+    """Whether finite matrices (..., d, d) are symmetric and positive definite, or perhaps.
 
-    By their minors: eigenvalues take LAPACK a microsecond for each matrix. In space only definite
-    ones, by more than rounding, count (Sylvester).
+    By their minors (Sylvester): eigenvalues take LAPACK a microsecond for each matrix.
     """
     a, b, c = Sigma[..., 0, 0], Sigma[..., 1, 1], Sigma[..., 0, 1]
     minor = a * b - c * c
-    if not (a.size and a.min() >= 0 and b.min() >= 0 and minor.min() >= 0):
+    if not (a.size and a.min() > 0 and minor.min() >= 0):
         return False
     if np.count_nonzero(c - Sigma[..., 1, 0]):
         return False

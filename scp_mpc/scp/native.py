@@ -5,15 +5,14 @@ core checks every number, and where it refuses one, `Step.read` says which and w
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from scp_mpc.arrays import FloatArray, as_array, frozen
+from scp_mpc.arrays import FloatArray, SampledArray, as_array, frozen, require_sampled
 from scp_mpc.deadline import Timer
 from scp_mpc.errors import InvalidArgumentError, TooManyObstaclesError
 from scp_mpc.native.core import NativeCore, Outcome
@@ -33,8 +32,7 @@ _DUALS |= {"inputs": "input_bounds", "slack": "pins", "states": "state_bounds"}
 _COUNTS = {"kkt": "kkt", "native": "solved"} | {n: n for n in ("ranked", "cut", "infeasible")}
 
 
-@dataclass(frozen=True, eq=False)
-class Given:
+class Given(NamedTuple):
     """What a step was given, nobody else's: arguments of `Step.read`."""
 
     problem: Problem
@@ -47,10 +45,7 @@ class Given:
 
     def read(self) -> Step:
         """The step."""
-        return Step.read(
-            *(self.problem, self.x0, self.x_ref, self.obstacles),
-            *(self.robot_covariance, self.nodes, self.u_last),
-        )
+        return Step.read(*self)
 
 
 class NativePlan(Plan):
@@ -58,17 +53,24 @@ class NativePlan(Plan):
 
     _outcome: Outcome
     _given: Given
+    _times: tuple[float, float, float, float]
 
     @classmethod
     def of(
-        cls, core: NativeCore, given: Given, timing: Timing, status: Status | None, left_out: int
+        cls,
+        core: NativeCore,
+        given: Given,
+        times: tuple[float, float, float, float],
+        status: Status | None,
+        left_out: int,
     ) -> "NativePlan":
         """The plan of the step that the core has just made."""
-        plan, outputs = object.__new__(cls), core.outputs
+        plan, outputs, outcome = object.__new__(cls), core.outputs, core.outcome()
         vars(plan).update(
-            _outcome=core.outcome(),
+            _outcome=outcome,
             _given=given,
-            timing=timing,
+            _times=times,
+            U=outcome.part(outcome.plan, "inputs"),
             status=_STATUSES[outputs.status] if status is None else status,
             cost=outputs.cost,
             iterations=outputs.iterations,
@@ -76,6 +78,8 @@ class NativePlan(Plan):
             history=(),
             left_out=left_out,
         )
+        if not outputs.contact:
+            vars(plan)["contact"] = ()
         return plan
 
     def __getattr__(self, name: str) -> Any:
@@ -86,10 +90,9 @@ class NativePlan(Plan):
         return part
 
     @cached_property
-    def contact(self) -> tuple[int, ...]:
+    def timing(self) -> Timing:
         """See `Plan`."""
-        told = vars(self).get("_outcome")
-        return self.step.contact if told is None or told.outputs.contact else ()
+        return Timing(*self._times)
 
 
 def _iterate(outcome: Outcome, given: Given, _: Plan) -> Iterate:
@@ -149,7 +152,6 @@ def _step(_: Outcome, given: Given, plan: Plan) -> Step:
 _PARTS: dict[str, Callable[[Outcome, Given, Plan], Any]] = {
     "iterate": _iterate,
     "X": lambda outcome, _, __: outcome.part(outcome.plan, "states"),
-    "U": lambda outcome, _, __: outcome.part(outcome.plan, "inputs"),
     "s": lambda _, given, plan: plan.iterate.s[: len(given.obstacles)],
     "slack": _slack,
     "x_slack": lambda _, given, plan: frozen(given.problem.excess(plan.X)),
@@ -257,8 +259,8 @@ class NativeEngine:
         if wrong is not None:
             given.read()
             raise InvalidArgumentError(wrong, "is refused by the native core")
-        timing = Timing(0.0, wrote - began, solved - wrote, solved - began)
-        return NativePlan.of(self.core, given, timing, status, left_out)
+        times = 0.0, wrote - began, solved - wrote, solved - began
+        return NativePlan.of(self.core, given, times, status, left_out)
 
     def _write(
         self,
@@ -269,43 +271,41 @@ class NativeEngine:
         u_last: ArrayLike | None,
     ) -> Given:
         """Write a step into the core's buffers."""
-        model, N = self._problem.model, self._problem.horizon
+        model = self._problem.model
         known = self._write_obstacles(obstacles)  # first: where there is no room, the core changes
         inputs, views = self.core.inputs, self.core.views
-        views["x0"][:] = as_array("x0", x0, (model.nx,))
-        reference = as_array("x_ref", x_ref, (N + 1, model.nx), (model.nx,))
-        views["x_ref"][:] = reference
+        _write("x0", x0, views)
+        if isinstance(x_ref, SampledArray):
+            require_sampled("x_ref", x_ref, model.dt)
+        _write("x_ref", x_ref, views, views["x0"].shape)
         inputs.has_u_last = u_last is not None
+        last = uncertain = None
         if u_last is not None:
-            views["u_last"][:] = as_array("u_last", u_last, (model.nu,))
+            _write("u_last", u_last, views)
+            last = views["u_last"].copy()
         inputs.has_robot_covariance = robot_covariance is not None
-        uncertain = None
         if robot_covariance is not None:
-            shape = (model.dim, model.dim)
-            uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
-            views["robot_covariance"][:] = uncertain
-        u = None if u_last is None else views["u_last"].copy()
+            _write("robot_covariance", robot_covariance, views, (model.dim, model.dim))
+            uncertain = views["robot_covariance"].copy()
         x = views["x0"].copy(), views["x_ref"].copy()
-        return Given(self._problem, *x, known, uncertain, self._nodes, u)
+        return Given(self._problem, *x, known, uncertain, self._nodes, last)
 
     def _write_obstacles(self, obstacles: Sequence[ObstaclePrediction]) -> ObstaclePredictions:
-        problem, views = self._problem, self.core.views
-        M = problem.max_obstacles
-        known = as_predictions(obstacles)
-        if len(known) > M:
-            raise TooManyObstaclesError("obstacles", f"{len(known)} exceed max_obstacles = {M}")
-        model, J = problem.model, len(known)
+        problem, core = self._problem, self.core
+        model, M, known = problem.model, problem.max_obstacles, as_predictions(obstacles)
+        J = len(known)
+        if J > M:
+            raise TooManyObstaclesError("obstacles", f"{J} exceed max_obstacles = {M}")
         stacked = ObstaclePredictions.of(known, problem.horizon, model.dim, model.dt)
-        shapes = stacked.shapes
-        if shapes is not None and not self.core.has_room(shapes):
-            memory = self.core.memory
-            self.core = NativeCore(*self._laid_out, room=shapes)
-            self.core.memory, views = memory, self.core.views
+        if stacked.shapes is not None and not core.has_room(stacked.shapes):
+            core = NativeCore(*self._laid_out, room=stacked.shapes)
+            core.memory, self.core = self.core.memory, core
+        views = core.views
         views["means"][:J] = stacked.means
         views["covariances"][:J] = stacked.covariances
         views["radii"][:J] = stacked.radii
-        self.core.set_shapes(shapes or (None,) * J)
-        self.core.inputs.count = J
+        core.set_shapes(stacked.shapes)
+        core.inputs.count = J
         return stacked
 
     def _guess(self, nominal: Iterate) -> int:
@@ -320,3 +320,13 @@ class NativeEngine:
                     values = getattr(duals, name)
                     parts[theirs][:] = values if values.size else 0.0
         return len(known)
+
+
+def _write(
+    name: str, value: ArrayLike, views: dict[str, NDArray[Any]], *shapes: tuple[int, ...]
+) -> None:
+    """Write an argument into its view; only its shape and kind are checked here."""
+    view = views[name]
+    if type(value) is not np.ndarray or value.dtype != np.float64 or value.shape != view.shape:
+        value = as_array(name, value, view.shape, *shapes)
+    view[...] = value

@@ -98,7 +98,7 @@ class Step:
         uncertain = None
         if robot_covariance is not None:
             shape = (model.dim, model.dim)
-            uncertain = as_array("robot_covariance", robot_covariance, shape, (N + 1, *shape))
+            uncertain = as_array("robot_covariance", robot_covariance, (N + 1, *shape), shape)
             uncertain = np.broadcast_to(uncertain, (N + 1, *shape))
             require_positive_semidefinite("robot_covariance", uncertain)
         last = None if u_last is None else as_array("u_last", u_last, (model.nu,))
