@@ -108,10 +108,11 @@ class Plan:
         iterations: Steps of the descent that led to this plan.
         qps: Quadratic programs in this control step by who finished them: the solver that was
             asked, "osqp" by default, whose active set was exact after one repair at most;
-            "repaired" where it took more; "piqp", the rescue; "kkt", a few linear systems instead
-            of a program: a linear robot's plan that ignores the obstacles. And those that nobody
-            finished: "ranked", an alternative whose optimum was bounded from below; "cut", one that
-            cannot win; "infeasible", one that was proved to have no solution.
+            "repaired" where it took more; "piqp", the rescue; "native", the core in C; "kkt", a few
+            linear systems instead of a program: a linear robot's plan that ignores the obstacles.
+            And those that nobody finished: "ranked", an alternative whose optimum was bounded from
+            below, by the core in C found; "cut", one that cannot win; "infeasible", one that was
+            proved to have no solution.
         candidates: Alternative plans that were tried; `switched` if one of them won.
         timing: Seconds spent.
         iterate: The point with its multipliers, padded to all obstacle slots, at all nodes.
