@@ -26,7 +26,7 @@ static const double DOUBLE = -0.99;    /* in Cardano's formula: -1 where two eig
 static const double TURN = 6.283185307179586;
 
 typedef struct {
-    step_room room, scaled;  /* of the scaled step: its covariances and what follows from them */
+    step_room room, scaled;  /* the second is that of the scaled step */
     double *wide_radii;      /* (M, C) */
     double *stds;            /* (M, N+1) largest standard deviations of the predictions */
     double *begin, *along;   /* (max_shapes, max_edges, d) of edges; zeros for corners */
@@ -36,21 +36,27 @@ typedef struct {
 
 /* ---- memory */
 
+/* What scaling changes, if there is any. */
+static void lay_out_scaled(const scp_core *core, arena *from, nodes of, int scales, step_room *room)
+{
+    size_t M = (size_t)core->at.M, C = (size_t)of.size, d = (size_t)core->at.d;
+    room->scaled = doubles(from, scales ? M * (C + 1) * d * d : 0);
+    room->scaled_std = doubles(from, scales ? M * (C + 1) : 0);
+    room->rotation = doubles(from, M * C * d * d);
+    room->deviation = doubles(from, M * C * d);
+    room->decomposed = bytes(from, M * C);
+}
+
 void lay_out_room(const scp_core *core, arena *from, nodes of, step_room *room)
 {
     size_t M = (size_t)core->at.M, C = (size_t)of.size, d = (size_t)core->at.d;
-    int scales = core->p.sizes || core->p.backup_sizes;
     room->nodes = of;
     room->means = doubles(from, M * (C + 1) * d);
     room->covariances = doubles(from, M * (C + 1) * d * d);
     room->largest_std = doubles(from, M * (C + 1));
-    room->scaled = doubles(from, scales ? M * (C + 1) * d * d : 0);
-    room->scaled_std = doubles(from, scales ? M * (C + 1) : 0);
-    room->drift = doubles(from, M * C);
+    room->drift = doubles(from, of.K > 1 ? M * C : 0);
     room->radii = doubles(from, M * C);
-    room->rotation = doubles(from, M * C * d * d);
-    room->deviation = doubles(from, M * C * d);
-    room->decomposed = bytes(from, M * C);
+    lay_out_scaled(core, from, of, core->p.sizes || core->p.backup_sizes, room);
 }
 
 void lay_out_step(scp_core *core, arena *from)
@@ -65,7 +71,7 @@ void lay_out_step(scp_core *core, arena *from)
         my = &none;
     lay_out_room(core, from, at->nodes, &my->room);
     if (p->joint_risk > 0)
-        lay_out_room(core, from, at->nodes, &my->scaled);
+        lay_out_scaled(core, from, at->nodes, 1, &my->scaled);
     my->wide_radii = doubles(from, M * C);
     my->stds = doubles(from, M * (N + 1));
     my->begin = doubles(from, shapes * (size_t)p->max_edges * d);
@@ -83,8 +89,9 @@ void lay_out_step(scp_core *core, arena *from)
 
 size_t scratch_of_step(const scp_core *core)
 {
-    size_t C = (size_t)core->at.nodes.size, M = (size_t)core->at.M;
-    return M * C + (4 * (size_t)core->at.nb + 2 * (size_t)core->at.nu) * sizeof(double) + 1024;
+    const layout *at = &core->at;
+    int longest = backup_horizon(core) * at->nodes.count;
+    return (size_t)(at->M * longest) + (size_t)(at->nodes.n * at->d) * sizeof(double) + 128;
 }
 
 /* ---- checks */
