@@ -23,7 +23,8 @@ enum {
     MOST_PROMISING = 3,   /* where others promise to cost much less */
     BEAM = 3,             /* candidates among polytopes that are varied */
     ROUNDS = 5,           /* of variations */
-    CHANGES = 100         /* of the active set of a program */
+    CHANGES = 50,         /* of the active set, before what is known of it is forgotten, */
+    MOST_CHANGES = 4000   /* and in all */
 };
 
 /* What one program about a path seems to lead to. */
@@ -166,8 +167,10 @@ void memo_alternatives(scp_core *core, memo *m)
     memo_ints(m, 1, &room->made.count);
     memo_ints(m, SCP_MOST_CANDIDATES, room->made.obstacle);
     memo_ints(m, SCP_MOST_CANDIDATES, room->made.number);
-    for (int i = 0; i < most_candidates(core); i++)
-        memo_doubles(m, size, room->base[i].force);
+    for (int i = 0; i < SCP_MOST_CANDIDATES; i++) /* as many, whatever a core has room for */
+        memo_doubles(m, size, i < most_candidates(core) ? room->base[i].force : NULL);
+    if (room->made.count > most_candidates(core))
+        room->made.count = most_candidates(core);
 }
 
 static const double *known_force(const multi_room *room, int obstacle, int number)
@@ -342,18 +345,40 @@ static void keep_known(const scp_core *core, const double *known, ranked *one)
         one->force[at->nf + pair_of(core, of, k)] = known[at->nf + pair_of(core, of, k)];
 }
 
-/* Look at one program, from the plan that is there. */
-static void look(scp_core *core, relaxation level, double limit, ranked *one)
+/* Solve a program from the multipliers of the step before, or those of the plan that is there; where
+ * that leads nowhere, from none. */
+static qp_end settle_one(scp_core *core, const double *known, double limit)
+{
+    const layout *at = &core->at;
+    multi_room *room = core->multi;
+    const program *p = &room->program;
+    solution *s = &room->solution;
+    int systems = 0, all = p->qp.nf + p->qp.pairs;
+    if (known != NULL) {
+        for (int k = 0; k < p->qp.pairs; k++)
+            s->force[k] = known[at->nf + pair_of(core, &room->plan.pairs, k)];
+        guess_active(p, known, s->force, s);
+    } else {
+        guess_active(p, room->plan.reaction, room->plan.force, s);
+    }
+    qp_end end = settle(core, &p->qp, s, CHANGES, limit, &systems);
+    if (end != QP_UNSOLVED)
+        return end;
+    memset(s->active, 0, (size_t)all * sizeof *s->active);
+    memset(s->relaxed, 0, (size_t)all * sizeof *s->relaxed);
+    return settle(core, &p->qp, s, MOST_CHANGES, limit, &systems);
+}
+
+/* Look at one program; `known` multipliers of the step before may be NULL. */
+static void look(scp_core *core, relaxation level, double limit, const double *known, ranked *one)
 {
     multi_room *room = core->multi;
     program *p = &room->program;
     solution *s = &room->solution;
-    int systems = 0;
     take_path(core, one->path);
     find_planes(core, core->now, &room->plan.pairs, room->about.y, &room->about);
     write_program(core, &room->plan, &p->c, &room->about, level, NULL, p);
-    guess_active(p, room->plan.reaction, room->plan.force, s);
-    qp_end end = settle(core, &p->qp, s, CHANGES, limit, &systems);
+    qp_end end = settle_one(core, known, limit);
     keep_force(core, s->force, one);
     one->looked = 1;
     one->merit = end == QP_SOLVED ? qp_merit(core, &p->qp, s->v) : INFINITY;
@@ -395,7 +420,7 @@ static int rank(scp_core *core, const result *best, int thorough, int count, ran
             core->out.cut++;
             continue;
         }
-        look(core, level, most, one);
+        look(core, level, most, known[order[i]], one);
         if (only_best && !one->waits)
             limit = fmin(limit, one->merit);
     }
