@@ -14,7 +14,7 @@ from scp_mpc.native.library import AXES, BICYCLE, EXACT, LINEAR, OWN_MODEL, UNIC
 from scp_mpc.problem import Problem
 from scp_mpc.settings import Settings
 
-# Room for the shapes of one obstacle: more of anything, and the core is set up again.
+# Room for the shape of one obstacle.
 CORNERS, FACES, EDGES = 16, 16, 24
 # Those of control/backup.py.
 BACKUP_SECONDS = 4.0

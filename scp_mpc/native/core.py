@@ -106,7 +106,7 @@ class NativeCore:
         settings: How to solve it.
         deadline: Of a step [s]; None for none.
         timer: Tells the time [s] to deadlines; None for the machine's clock.
-        room: Shapes of obstacles for which there has to be room, if they are large.
+        room: Shapes of obstacles for which there has to be room.
 
     Attributes:
         inputs: The struct of a step's inputs.
@@ -131,10 +131,11 @@ class NativeCore:
         self._call = library()
         self._error: BaseException | None = None
         values = constants(problem, settings, deadline)
-        for solid in filter(None, room):
-            for name, part in _PARTS:
-                most = values[f"max_{name}"]
-                values[f"max_{name}"] = max(most, len(getattr(solid, part)))
+        solids = [solid for solid in room if solid is not None]
+        for name, part in _PARTS:  # room for shapes is made when the first ones come
+            largest = max((len(getattr(solid, part)) for solid in solids), default=0)
+            values[f"max_{name}"] = max(largest, values[f"max_{name}"]) if solids else 0
+        values["max_shapes"] *= bool(solids)
         struct, self._kept = _filled(values)
         self._calls_back = values["model"] == OWN_MODEL or timer is not None
         if values["model"] == OWN_MODEL:

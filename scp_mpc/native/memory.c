@@ -3,13 +3,17 @@
  */
 #include "core.h"
 
+/* NULL stands for zeros, and for nothing to be recalled. */
 void memo_doubles(memo *m, size_t n, double *values)
 {
-    if (m->numbers != NULL) {
-        double *there = m->numbers + m->count;
-        memcpy(m->recalls ? values : there, m->recalls ? there : values, n * sizeof *values);
-    }
+    double *there = m->numbers == NULL ? NULL : m->numbers + m->count;
     m->count += n;
+    if (there == NULL)
+        return;
+    if (values == NULL && !m->recalls)
+        memset(there, 0, n * sizeof *there);
+    else if (values != NULL)
+        memcpy(m->recalls ? values : there, m->recalls ? there : values, n * sizeof *values);
 }
 
 void memo_ints(memo *m, size_t n, int *values)
