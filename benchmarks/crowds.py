@@ -42,6 +42,7 @@ def main(
     runs: int | None = None,
     jobs: int = 1,
     only: str = "",
+    solver: str = "osqp",
     echo: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Run what is missing and write table and numbers.
@@ -53,10 +54,11 @@ def main(
         runs: How many of each group; their seeds are 0, 1, ...
         jobs: Processes.
         only: Part of the names of the groups to run.
+        solver: "osqp" or "native".
         echo: Takes the Markdown table.
     """
     count = RUNS[kind] if runs is None else runs
-    rows = in_one_thread(_rows, kind, recordings or [], count, out, jobs, only)
+    rows = in_one_thread(_rows, kind, recordings or [], count, out, jobs, only, solver)
     found = [
         {"group": group, **summed(some), **progress_of(some), "moving": moving(some)}
         for group, some in rows.items()
@@ -65,9 +67,15 @@ def main(
 
 
 def _rows(
-    kind: str, recordings: list[Path], runs: int, out: Path, jobs: int, only: str
+    kind: str,
+    recordings: list[Path],
+    runs: int,
+    out: Path,
+    jobs: int,
+    only: str,
+    solver: str,
 ) -> dict[Group, list[dict[str, Any]]]:
-    every = dict(_episodes(kind, recordings))
+    every = dict(_episodes(kind, recordings, solver))
     episodes = {group: one for group, one in every.items() if only in ", ".join(group)}
     rows = {}
     with progress(runs * len(episodes), "run") as advance:
@@ -78,17 +86,20 @@ def _rows(
     return rows
 
 
-def _episodes(kind: str, recordings: list[Path]) -> Iterator[tuple[Group, Episode]]:
+def _episodes(kind: str, recordings: list[Path], solver: str) -> Iterator[tuple[Group, Episode]]:
     """What is run, by group."""
     for file in recordings:
         name = file.parent.name if file.name == "obsmat.txt" else file.stem
         for variant, options in DENSE.items() if kind == "dense" else RECORDED.items():
             episode = dense if kind == "dense" else as_they_were
-            yield (name, variant), partial(episode, file=file, options=options)
+            yield (name, variant), partial(episode, file=file, options=options, solver=solver)
     if kind == "reacting":
         for robot in ROBOTS:
             for count in PEOPLE:
-                yield (robot, str(count)), partial(reacting, robot=robot, count=count)
+                yield (
+                    (robot, str(count)),
+                    partial(reacting, robot=robot, count=count, solver=solver),
+                )
 
 
 def progress_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -160,6 +171,7 @@ if __name__ == "__main__":
     parser.add_argument("--recordings", type=Path, nargs="+", help="obsmat.txt, or frame id x y")
     parser.add_argument("--runs", type=int, help="of each group")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--solver", default="osqp", help="or native")
     parser.add_argument("--only", default="", help="groups whose names hold this")
     arguments = parser.parse_args()
     if arguments.kind != "reacting" and not arguments.recordings:

@@ -160,9 +160,11 @@ def problem(robot: str, count: int) -> Problem:
     return Problem(Unicycle(DT), Q=[1.0, 1.0, 0.01, 0.1], x_min=[*free, -0.3], **common)
 
 
-def reacting(seed: int, robot: str, count: int, seconds: float = SECONDS) -> dict[str, Any]:
+def reacting(
+    seed: int, robot: str, count: int, seconds: float = SECONDS, solver: str = "osqp"
+) -> dict[str, Any]:
     """Cross the square; what happened until the robot arrived, ready for JSON."""
-    run = reacting_run(seed, robot, count, seconds)
+    run = reacting_run(seed, robot, count, seconds, solver)
     there = np.linalg.norm(run.positions - GOAL, axis=1) < NEAR
     arrived = bool(there.any())
     end = int(there.argmax()) if arrived else run.steps
@@ -176,11 +178,13 @@ def reacting(seed: int, robot: str, count: int, seconds: float = SECONDS) -> dic
     }
 
 
-def reacting_run(seed: int, robot: str, count: int, seconds: float = SECONDS) -> Run:
+def reacting_run(
+    seed: int, robot: str, count: int, seconds: float = SECONDS, solver: str = "osqp"
+) -> Run:
     """The same, as a run; the deadline counts processor time, whatever else the machine does."""
-    task = problem(robot, count)
+    task, forgetful = problem(robot, count), StalenessPolicy(keep=0)
     return simulate(
-        MPC(task, Settings(staleness=StalenessPolicy(keep=0)), timer=process_time),
+        MPC(task, Settings(solver=solver, staleness=forgetful), timer=process_time),
         Square(task.model, count),
         sensor=TrackedSensor(noise=0.05, outage_rate=0.1, outage_time=1.0),
         steps=round(seconds / DT),

@@ -32,22 +32,30 @@ _FORGETFUL = StalenessPolicy(keep=0)  # the tracker remembers
 
 
 def dense(
-    seed: int, file: Path, options: dict[str, Any], seconds: float = SECONDS
+    seed: int,
+    file: Path,
+    options: dict[str, Any],
+    seconds: float = SECONDS,
+    solver: str = "osqp",
 ) -> dict[str, Any]:
     """Cross a dense crowd, there and back again; options are of the problem."""
-    run = dense_run(seed, read_recording(file), options, seconds)
+    run = dense_run(seed, read_recording(file), options, seconds, solver)
     return {"seed": seed, **judged(run), **_progress(run)}
 
 
 def dense_run(
-    seed: int, recording: Recording, options: dict[str, Any], seconds: float = SECONDS
+    seed: int,
+    recording: Recording,
+    options: dict[str, Any],
+    seconds: float = SECONDS,
+    solver: str = "osqp",
 ) -> Run:
     """The same, as a run."""
     problem, steps = replace(replay_problem(), **options), round(seconds / DT)
     people = thickened(recording, steps, np.random.default_rng(seed))
     crossing = Crossing.through(recording, "along")
     return simulate(
-        MPC(problem, Settings(deadline=None, staleness=_FORGETFUL)),
+        MPC(problem, Settings(deadline=None, solver=solver, staleness=_FORGETFUL)),
         ThereAndBack(crossing, problem.model, problem.horizon, people),
         sensor=TrackedSensor(),
         steps=steps,
@@ -79,10 +87,14 @@ def _at(path: FloatArray, time: float) -> FloatArray:
 
 
 def as_they_were(
-    seed: int, file: Path, options: dict[str, Any], steps: int | None = None
+    seed: int,
+    file: Path,
+    options: dict[str, Any],
+    steps: int | None = None,
+    solver: str = "osqp",
 ) -> dict[str, Any]:
     """Cross a recorded crowd for as long as it lasts; options are of the settings."""
-    settings = Settings(staleness=_FORGETFUL, **options)
+    settings = Settings(staleness=_FORGETFUL, solver=solver, **options)
     run = replay(read_recording(file), seed=seed, steps=steps, settings=settings)
     return {"seed": seed, **judged(run), **_progress(run)}
 

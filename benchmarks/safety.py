@@ -40,6 +40,7 @@ def main(
     episodes: int = EPISODES,
     alone: int = ALONE,
     jobs: int = 1,
+    solver: str = "osqp",
     echo: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Run what is missing and write table and numbers.
@@ -50,26 +51,29 @@ def main(
         episodes: How many; their seeds are 0, 1, ...
         alone: How many of them once more, with the goal alone as reference.
         jobs: Processes.
+        solver: "osqp" or "native".
         echo: Takes the Markdown table.
     """
     name = f"safety-{kind}"
-    rows = in_one_thread(_rows, kind, episodes, out / f"{name}.jsonl", jobs, True)
-    less = in_one_thread(_rows, kind, alone, out / f"{name}-alone.jsonl", jobs, False)
+    rows = in_one_thread(_rows, kind, episodes, out / f"{name}.jsonl", jobs, True, solver)
+    less = in_one_thread(_rows, kind, alone, out / f"{name}-alone.jsonl", jobs, False, solver)
     totals = {"path": summarise(rows), "goal alone": summarise(less)}
     content = {"kind": kind, **totals, "broken": broken(rows)}
     write(out, name.replace("-", "_"), markdown(totals), content, echo=echo)
 
 
-def _rows(kind: str, episodes: int, file: Path, jobs: int, along: bool) -> list[dict[str, Any]]:
+def _rows(
+    kind: str, episodes: int, file: Path, jobs: int, along: bool, solver: str
+) -> list[dict[str, Any]]:
     with progress(episodes, "episode") as advance:
-        one = partial(episode, moving=kind == "moving", along=along)
+        one = partial(episode, moving=kind == "moving", along=along, solver=solver)
         return run_episodes(one, range(episodes), file=file, jobs=jobs, advance=advance)
 
 
-def episode(seed: int, moving: bool, along: bool = True) -> dict[str, Any]:
+def episode(seed: int, moving: bool, along: bool = True, solver: str = "osqp") -> dict[str, Any]:
     """Drive through a world; what the world was and what happened."""
     world, began = World(seed, moving), process_time()
-    run = drive(world, along=along)
+    run = drive(world, along=along, solver=solver)
     seconds = process_time() - began
     return {
         "seed": seed,
@@ -199,4 +203,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=EPISODES, help="worlds")
     parser.add_argument("--alone", type=int, default=ALONE, help="of these without a path as well")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--solver", default="osqp", help="or native")
     main(**vars(parser.parse_args()), echo=print)

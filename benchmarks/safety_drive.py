@@ -120,16 +120,23 @@ class Way:
                 break
 
 
-def drive(world: World, controller: Controller | None = None, along: bool = True) -> Drive:
+def drive(
+    world: World,
+    controller: Controller | None = None,
+    along: bool = True,
+    solver: str = "osqp",
+) -> Drive:
     """Drive through a world until the robot stays near its goal or the time is over.
 
     Args:
         world: Where.
         controller: Who; `MPC` without a deadline if None.
         along: Whether to follow the shortest path around what stands, or to track the goal alone.
+        solver: Of that `MPC`.
     """
     problem = world.problem
-    controller = MPC(problem, Settings(deadline=None)) if controller is None else controller
+    if controller is None:
+        controller = MPC(problem, Settings(deadline=None, solver=solver))
     way = Way(world) if along else None
     states, plans, seconds, near = [world.start], list[Plan](), list[float](), 0
     for k in range(round(SECONDS / world.dt)):
