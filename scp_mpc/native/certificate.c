@@ -303,6 +303,14 @@ static double smallest_few(scp_core *core, int nv, int q, const double *factors,
     return (1 + least) / larger(1, -least - 1);
 }
 
+/* The upper part of a symmetric matrix, from its lower one. */
+static void mirror(int n, double *M)
+{
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < i; j++)
+            M[j * n + i] = M[i * n + j];
+}
+
 /* Of M (nv, nv), which is lost, across a basis; its largest counts as no less than `over`, and
  * directions that are gone bend up by that much. */
 static double smallest_of(scp_core *core, int nv, double *M, int rank, const double *basis,
@@ -318,15 +326,17 @@ static double smallest_of(scp_core *core, int nv, double *M, int rank, const dou
             for (int b = 0; b < rank; b++)
                 axpy(nv, -inner[b] / 2, basis + b * nv, Z + r * nv);
         }
-        for (int r = 0; r < rank; r++)
-            for (int i = 0; i < nv; i++) {
-                axpy(nv, -basis[r * nv + i], Z + r * nv, M + i * nv);
-                axpy(nv, -Z[r * nv + i], basis + r * nv, M + i * nv);
+        for (int i = 0; i < nv; i++)
+            for (int r = 0; r < rank; r++) {
+                axpy(i + 1, -basis[r * nv + i], Z + r * nv, M + i * nv);
+                axpy(i + 1, -Z[r * nv + i], basis + r * nv, M + i * nv);
             }
+        mirror(nv, M);
         double up = larger(over, largest_abs(nv * nv, M));
-        for (int r = 0; r < rank; r++)
-            for (int i = 0; i < nv; i++)
-                axpy(nv, up * basis[r * nv + i], basis + r * nv, M + i * nv);
+        for (int i = 0; i < nv; i++)
+            for (int r = 0; r < rank; r++)
+                axpy(i + 1, up * basis[r * nv + i], basis + r * nv, M + i * nv);
+        mirror(nv, M);
     }
     if (eigen_least(nv, M, &least, &most, direction, room))
         return (double)NAN;
