@@ -120,8 +120,8 @@ static int check_sizes(const scp_problem *p)
     REQUIRE(p->dt > 0 && is_number(p->dt), dt);
     REQUIRE(are_places(p->dim, p->position, p->nx), position);
     REQUIRE(p->heading >= -1 && p->heading < p->nx && (p->heading < 0 || p->dim == 2), heading);
-    REQUIRE(are_places(p->velocities, p->velocity, p->nx), velocity);
     REQUIRE(p->velocities == 0 || p->velocities == 1 || p->velocities == p->dim, velocities);
+    REQUIRE(are_places(p->velocities, p->velocity, p->nx), velocity);
     return 0;
 }
 
@@ -133,7 +133,8 @@ static int check_room(const scp_problem *p)
     double nv = N * p->nu + M, ny = N * count * d + M + N * (2 * p->nu + rows);
     double stage = p->nx + p->nu;
     REQUIRE(nv * (ny + M) <= MOST_NUMBERS && N * count * (M + d) * d * stage <= MOST_NUMBERS &&
-                N * stage * stage <= MOST_NUMBERS && N * p->nx * nv <= MOST_NUMBERS, horizon);
+                N * stage * stage <= MOST_NUMBERS && N * p->nx * nv <= MOST_NUMBERS &&
+                rows * p->nx <= MOST_NUMBERS, horizon);
     REQUIRE((late + N) * (count + 1) * (M + 1) * d * d <= MOST_NUMBERS &&
                 (late + N) * stage <= MOST_NUMBERS, dt);
     return 0;
