@@ -61,8 +61,8 @@ class MissingCoreError(InvalidArgumentError):
     def __init__(self, reason: str) -> None:
         remedy = (
             "It is compiled when the package is installed: install a C compiler, for example by "
-            "`apt install gcc`, or unset SCP_MPC_PURE and SCP_MPC_NO_ZIG, and install scp-mpc "
-            "from source again, by `pip install --force-reinstall --no-deps .` in a clone"
+            "`apt install gcc`, or unset SCP_MPC_PURE and SCP_MPC_NO_ZIG, and install it "
+            "again, by `pip install --force-reinstall --no-deps --no-cache-dir .` in a clone"
         )
         super().__init__("solver", f"'native' is not there: {reason}. {remedy}")
         self.reason = reason

@@ -39,6 +39,7 @@ from scp_mpc import (
     Status,
     Unicycle,
 )
+from scp_mpc.arrays import SampledArray
 from scp_mpc.control import backup
 from scp_mpc.native import constants, core, library
 from scp_mpc.scp.native import _STATUSES, NativePlan
@@ -290,9 +291,6 @@ def test_predictions_that_are_too_old():
     assert controllers[0].counts[Status.STALE] == 1
 
 
-NAN = np.full((1, N + 1, 2), np.nan)
-
-
 @needs_core
 @pytest.mark.parametrize(
     "change",
@@ -303,6 +301,8 @@ NAN = np.full((1, N + 1, 2), np.nan)
         {"x0": "here"},
         {"x_ref": np.zeros((N, 4))},
         {"x_ref": np.full((N + 1, 4), np.inf)},
+        {"x_ref": SampledArray.of(np.zeros((N + 1, 4)), 0.1)},
+        {"obstacles": ObstaclePredictions(np.zeros((1, N + 1, 2)), np.eye(2), 0.1, dt=0.1)},
         {"obstacles": [None]},
         {"obstacles": ObstaclePrediction.static(N, [9, 9], 0.1)},
         {"obstacles": [ObstaclePrediction.static(N, [9, 9], 0.1)] * 2},
