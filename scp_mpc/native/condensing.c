@@ -461,7 +461,8 @@ static void respond_states(const scp_core *core, const derivatives *D, sensitivi
     int nx = at->nx, nu = at->nu, n = at->n, nv = at->nv;
     for (int i = 0; i < at->N; i++) {
         const double *B = D->B + i * nx * nu, *K = by->K + i * nu * nx, *T = by->T + i * nu * nu;
-        double *closed = by->A + i * nx * nx, *E = by->E + i * nx * n, *before = E - nx * n;
+        double *closed = by->A + i * nx * nx, *E = by->E + i * nx * n;
+        const double *before = i ? E - nx * n : E;
         double *U = by->S + (at->u + i * nu) * nv;
         int w = i * nu;
         for (int r = 0; r < nu; r++) {
@@ -564,8 +565,8 @@ void curvature_in_v(scp_core *core, const sensitivity *by, const double *stages,
     memset(W, 0, (size_t)nv * (size_t)nv * sizeof(double));
     for (int i = N - 1; i >= 0; i--) {
         const double *H = stages + i * size * size, *K = by->K + i * nu * nx;
-        const double *T = by->T + i * nu * nu, *E = by->E + i * nx * n, *before = E - nx * n;
-        const double *U = by->S + (at->u + i * nu) * nv;
+        const double *T = by->T + i * nu * nu, *E = by->E + i * nx * n;
+        const double *U = by->S + (at->u + i * nu) * nv, *before = i ? E - nx * n : E;
         int w = (i + 1) * nu, heading = core->p.heading;
         if (sway)
             axpy(w, sway[i], E + heading * n, later + heading * n);
