@@ -17,11 +17,11 @@ from scp_mpc.trajectory import Trajectory
 
 
 class PeerMissingError(ScpMpcError, ImportError):
-    """A peer is not installed; it comes with the extra `peers`."""
+    """A peer is not installed, or does not run here."""
 
-    def __init__(self, package: str) -> None:
+    def __init__(self, package: str, reason: str = "it comes with the extra 'peers'") -> None:
         """Say what is missing and how to get it."""
-        super().__init__(f"{package} is not installed; it comes with the extra 'peers'")
+        super().__init__(f"{package} is not installed; {reason}")
 
 
 @dataclass(frozen=True, eq=False)
