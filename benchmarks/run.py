@@ -12,6 +12,8 @@ programs    QP solvers on recorded programs
 robots      closed loops of all robots, relative to the double integrator among 5 obstacles
 user_models one robot as a plain function, a CasADi expression and built in
 scenarios   the report's four scenarios, 600 steps each
+race        closed loops of scp_mpc on OSQP and in C, acados, Fatrop and IPOPT, in turns on one
+            core; `python -m benchmarks.peers.acados` installs acados for it
 ablation    what the parts of the loop and its solver's options are worth
 """
 
@@ -25,6 +27,7 @@ from benchmarks import (
     horizon_timing,
     optimality,
     programs,
+    race,
     robots,
     scaling,
     scenarios,
@@ -42,6 +45,7 @@ BENCHMARKS = (
     "robots",
     "user_models",
     "scenarios",
+    "race",
     "ablation",
 )
 
@@ -58,6 +62,8 @@ def run(name: str, out: Path, steps: int, seed: int, echo: Callable[[str], objec
     """
     if name == "horizon":
         horizon_timing.main(out, steps, seed, echo=echo, crowds=True)
+    elif name == "race":
+        race.main(out, steps, seed, echo)
     elif name == "scaling":
         found = in_one_thread(scaling.rows, steps)
         fitted = scaling.exponents(found)

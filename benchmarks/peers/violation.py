@@ -47,19 +47,19 @@ def largest_violation(
         s - margin.upper,
     ]
     if obstacles:
-        amounts.append(-_constraint(problem, obstacles, states[:, model.position], s))
+        amounts.append(-clearances(problem, obstacles, states[:, model.position], s))
     worst = max(float(amount.max(initial=0.0)) for amount in amounts)
     finite = all(np.isfinite(amount).all() for amount in amounts)
     return worst if finite else np.inf
 
 
-def _constraint(
+def clearances(
     problem: Problem,
     obstacles: Sequence[ObstaclePrediction],
     positions: FloatArray,
     s: FloatArray,
 ) -> FloatArray:
-    """The constraint function g (M, N) at positions (N+1, d), row 0 now."""
+    """Return the constraint function g (M, N) [m] at positions (N+1, d), row 0 now."""
     sets = NoGoSets.from_predictions(
         obstacles, problem.robot_radius, len(obstacles), problem.horizon, problem.model.dim
     )
