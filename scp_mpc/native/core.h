@@ -399,20 +399,27 @@ size_t scratch_of_step(const scp_core *core);
 /* Checks core->in; 0, or the number of the input that is wrong. Then core->now is `plain`; `wide` has
  * radii of its own, which are not filled yet; bounds that are the same are one array. */
 int read_step(scp_core *core);
+void brake_bounds(scp_core *core); /* core->braked_*, once a step */
+/* Step.scaled with sizes (J, C); there is one scaled step */
+void scale_step(scp_core *core, const step *from, const double *sizes, step *to);
+
+/* ---- predictions.c; step.py */
+
 void lay_out_room(const scp_core *core, arena *from, nodes of, step_room *room);
+void lay_out_scaled(const scp_core *core, arena *from, nodes of, int scales, step_room *room);
+double largest_variance(int d, const double *Sigma);
+/* whether all are symmetric and positive semi-definite; stds (count,) may be NULL */
+int are_covariances(int d, int count, const double *Sigma, double *stds);
 void predict(const scp_core *core, const predictions *given, const double *robot_covariance,
              double scale, step_room *room, step *to); /* all of a step but x0, x_ref and u_last */
-void brake_bounds(scp_core *core); /* core->braked_*, once a step */
-double largest_variance(int d, const double *Sigma);
+void scale_covariances(int d, const double *sizes, double scale, nodes of, step_room *room, step *to);
 /* node i counts from 0 = now: `path` is (C+1, d) */
 int within(const scp_core *core, const step *at, const double *path, const double *s,
            double distance, const uint8_t *known, uint8_t *near); /* how many; near (J, C) */
 void depths(scp_core *core, const step *at, const double *path, const double *s,
             double *deep); /* (J, C); path (C, d) of nodes 1 .. C; s (M,) */
 void path_of(const scp_core *core, const double *y, double *path); /* (C+1, d), absolute */
-/* Step.scaled with sizes (J, C), Step.risks (J, C) of a path (C, d); there is one scaled step */
-void scale_step(scp_core *core, const step *from, const double *sizes, step *to);
-void step_risks(const scp_core *core, const step *at, const double *path, double *risks);
+void step_risks(const scp_core *core, const step *at, const double *path, double *risks); /* (J, C) */
 
 /* ---- braking.c; braking.py, problem.py */
 
@@ -431,17 +438,43 @@ double row_excess(const scp_core *core, int N, const double *X, int hard_only); 
 double plan_cost(const scp_core *core, const double *X, const double *U, const double *s);
 double plan_penalty(const scp_core *core, const double *slack, const double *X); /* slack (M, C) */
 
-/* ---- condensing.c */
+/* ---- plans.c */
 
-void lay_out_condensing(scp_core *core, arena *from);
-void set_up_condensing(scp_core *core);
-void lay_out_sensitivity(const scp_core *core, arena *from, sensitivity *by);
+void copy_doubles(int count, const double *from, double *to); /* onto itself is allowed */
+void lay_out_derivatives(const scp_core *core, arena *from, derivatives *D);
 void lay_out_nominal(const scp_core *core, arena *from, nominal *n);
 void copy_nominal(const scp_core *core, const nominal *from, nominal *to);
 void lay_out_result(const scp_core *core, arena *from, result *r);
 void copy_result(const scp_core *core, const result *from, result *to);
 void lay_out_iterate(const scp_core *core, arena *from, scp_iterate *it);
 void copy_iterate(const scp_core *core, const scp_iterate *from, scp_iterate *to);
+
+/* ---- riccati.c; condensing.py */
+
+void add_product(int m, int n, const double *A, const double *x, double *y);   /* y += A x, A (m, n) */
+void add_product_t(int m, int n, const double *A, const double *x, double *y); /* y += A'x */
+void derivatives_roll(const scp_core *core, const derivatives *D, double *e);     /* D e = pushed, in place */
+void derivatives_costates(const scp_core *core, const derivatives *D, double *nu); /* D'nu = forces, in place */
+/* coordinates (C, d) that go with de (N, nx) and du (N, nu), to first order */
+void derivatives_positions(const scp_core *core, const derivatives *D, const double *de,
+                           const double *du, double *dp);
+void lay_out_sensitivity(const scp_core *core, arena *from, sensitivity *by);
+int sensitivity_along(scp_core *core, const derivatives *D, sensitivity *by); /* 0, or no numbers */
+void respond(const scp_core *core, const derivatives *D, const sensitivity *by, const double *v,
+             double sign, double *de, double *du); /* of sign v, inputs only */
+/* Second derivatives (nv, nv) in v of stages (N, nx+nu, nx+nu), and sway (N,) in headings or NULL:
+ * Transcription._condensed_curvature, symmetric, whole */
+void curvature_in_v(scp_core *core, const sensitivity *by, const double *stages, const double *sway,
+                    double *W);
+/* The change of inputs that is optimal after a drift (N, nx) from a plan that is its own reference;
+ * the deviations replace the drift. 0, or no numbers */
+int regulate(scp_core *core, const double *A, const double *B, double *drift, double *du);
+size_t scratch_of_riccati(const scp_core *core);
+
+/* ---- condensing.c; condensing.py, layout.py */
+
+void lay_out_condensing(scp_core *core, arena *from);
+void set_up_condensing(scp_core *core);
 void begin_condensing(scp_core *core);                       /* drift of a linear robot */
 int roll_out(scp_core *core, const double *U, const double *guess_e, rollout *roll); /* 0, or no numbers */
 /* back to a plan whose first state is not the state now: inputs and deviations (N, nx) */
@@ -451,13 +484,7 @@ void outputs_of(const scp_core *core, const double *p, const double *s, const do
                 const double *e, double *y); /* layout.outputs */
 void y_of(const scp_core *core, const condensed *c, const double *v, double *y);
 void deviations_of(const scp_core *core, const condensed *c, const double *v, double *e);
-/* Second derivatives (nv, nv) in v of stages (N, nx+nu, nx+nu), and sway (N,) in headings or NULL:
- * Transcription._condensed_curvature, symmetric, whole */
-void curvature_in_v(scp_core *core, const sensitivity *by, const double *stages, const double *sway,
-                    double *W);
 size_t scratch_of_condensing(const scp_core *core);
-void derivatives_roll(const scp_core *core, const derivatives *D, double *e);     /* D e = pushed, in place */
-void derivatives_costates(const scp_core *core, const derivatives *D, double *nu); /* D'nu = forces, in place */
 
 /* ---- certificate.c */
 
