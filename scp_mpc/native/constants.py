@@ -16,6 +16,7 @@ from scp_mpc.settings import Settings
 
 # Room for the shape of one obstacle.
 CORNERS, FACES, EDGES = 16, 16, 24
+_COUNTS = "max_iterations", "max_candidates", "max_programs", "max_replayed", "multi_start_interval"
 # Those of control/backup.py.
 BACKUP_SECONDS = 4.0
 BACKUP_SPEEDS = 2.0 ** np.arange(-3, 5)
@@ -79,14 +80,11 @@ def constants(
         "max_faces": FACES,
         "max_edges": EDGES,
         "tolerance": settings.tolerance,
-        "max_iterations": settings.max_iterations,
-        "max_candidates": settings.max_candidates,
-        "max_programs": settings.max_programs,
-        "max_replayed": settings.max_replayed,
         "multi_start": int(settings.multi_start),
-        "multi_start_interval": settings.multi_start_interval,
         "deadline": deadline or 0.0,
     }
+    for name in _COUNTS:
+        values[name] = min(getattr(settings, name), np.iinfo(np.intc).max)
     if not isinstance(margin, Margin):
         long = max(problem.horizon, int(np.ceil(BACKUP_SECONDS / model.dt)))
         for name, owner in ("sizes", problem), ("backup_sizes", replace(problem, horizon=long)):

@@ -169,8 +169,8 @@ def test_plans_are_those_of_the_loop(name):
 @needs_core
 def test_multipliers_residuals_and_risk_are_those_of_the_loop():
     this = CASES["between"][0]
-    given = ahead(this, 2)
-    native, loop = (SCP(this, settings).solve(*given) for settings in (NATIVE, OSQP))
+    given, more = ahead(this, 2), {"max_programs": 2**32 + 200, "max_candidates": 2**40}
+    native, loop = (SCP(this, replace(s, **more)).solve(*given) for s in (NATIVE, OSQP))
     for name, values in vars(loop.multipliers).items():
         found = getattr(native.multipliers, name)
         assert found.size == values.size
