@@ -113,7 +113,7 @@ def test_it_stays_in_its_block_and_leaves_no_byte_to_chance():
 
 @pytest.fixture
 def core():
-    made = NativeCore(ROBOT, SETTINGS)
+    made = NativeCore(ROBOT, SETTINGS, room=[TRIANGLE])
     views, inputs = made.views, made.inputs
     for name in ("x0", "x_ref", "u_last", "robot_covariance"):
         views[name][:] = 0.0
