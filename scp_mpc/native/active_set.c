@@ -40,7 +40,7 @@ typedef struct {
     double *yielding;     /* (nv,) sum of the forces that are at their weight */
     double *w;            /* (nv,) */
     double *plain, *row;  /* (nv,) of the constraint that joins: as it answers to v and to w */
-    double *z, *r, *spare; /* (nv,) */
+    double *z, *r, *spare, *share; /* (nv,) */
     double *base;         /* (nv, nv) orthonormal rows */
     double *along, *point, *rest; /* (nv,) */
     int *span, *kept;     /* (nv,) entries of a held row before its zeros; constraints */
@@ -68,7 +68,7 @@ void lay_out_active_set(scp_core *core, arena *from)
     size_t nv = (size_t)core->at.nv, m = (size_t)(core->at.nf + core->at.most_pairs);
     to->factor = doubles(from, (nv + 1) * (nv + 2) / 2);
     double **vectors[] = {&to->wanted, &to->yielding, &to->w, &to->plain, &to->row,
-                          &to->z, &to->r, &to->spare, &to->along, &to->point, &to->rest};
+                          &to->z, &to->r, &to->spare, &to->share, &to->along, &to->point, &to->rest};
     for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++)
         *vectors[i] = doubles(from, nv);
     to->base = doubles(from, nv * nv);
@@ -244,6 +244,22 @@ static double *factor_row(const search *at, int k)
     return at->in->factor + (size_t)k * (size_t)(k + 1) / 2;
 }
 
+/* What the metric makes of a vector: back x, or where it is `across`, back'x. */
+static void stretch(const search *at, int across, const double *x, double *to)
+{
+    const metric *by = at->of->metric;
+    double *share = at->in->share;
+    memcpy(to, x, (size_t)at->nv * sizeof(double));
+    if (by->L != NULL && across)
+        solve_lower(at->nv, by->L, to);
+    else if (by->L != NULL)
+        solve_lower_t(at->nv, by->L, to);
+    for (int k = 0; by->L == NULL && k < by->q; k++)
+        share[k] = by->stretch[k] * dot(at->nv, by->V + (size_t)k * (size_t)at->nv, x);
+    for (int k = 0; by->L == NULL && k < by->q; k++)
+        axpy(at->nv, share[k], by->V + (size_t)k * (size_t)at->nv, to);
+}
+
 static double *held_row(const search *at, int k)
 {
     return at->s->rows + (size_t)k * (size_t)at->nv;
@@ -255,8 +271,8 @@ static int read_row(const search *at, int i, double *plain, double *row)
 {
     const qp *of = at->of;
     qp_row(of, i, plain);
-    if (of->back) {
-        gemv(at->nv, at->nv, of->back, plain, row);
+    if (of->metric) {
+        stretch(at, 1, plain, row);
         return at->nv;
     }
     memcpy(row, plain, (size_t)at->nv * sizeof(double));
@@ -267,10 +283,10 @@ static int read_row(const search *at, int i, double *plain, double *row)
 
 static void find_v(const search *at)
 {
-    if (at->of->back == NULL)
+    if (at->of->metric == NULL)
         return;
-    gemv(at->nv, at->nv, at->of->back, at->w, at->s->v);
-    axpy(at->nv, 1, at->of->origin, at->s->v);
+    stretch(at, 0, at->w, at->s->v);
+    axpy(at->nv, 1, at->of->metric->origin, at->s->v);
 }
 
 /* x <- L^-1 x and L^-T x */
@@ -483,8 +499,8 @@ static int extend(const search *at, int i, int span, double least)
 static void values_along(const search *at, const double *x)
 {
     storage *in = at->in;
-    if (at->of->back) {
-        gemv(at->nv, at->nv, at->of->back, x, in->spare);
+    if (at->of->metric) {
+        stretch(at, 0, x, in->spare);
         x = in->spare;
     }
     values(at->core, at->of, x, in->value);
@@ -862,7 +878,7 @@ static int unpack(const search *at)
 {
     solution *s = at->s;
     size_t k = (size_t)s->count;
-    if (at->of->back) {
+    if (at->of->metric) {
         for (int i = 0; i < s->count; i++)
             qp_row(at->of, s->index[i], held_row(at, i));
         gemm_nt(s->count, at->nv, s->count, s->rows, s->rows, s->factor);
@@ -894,7 +910,7 @@ static qp_end finish(scp_core *core, const search *at, int systems)
 qp_end settle(scp_core *core, const qp *of, solution *s, int most, double limit, int *systems)
 {
     storage *in = core->active;
-    search at = {core, of, s, in, of->back ? in->w : s->v, of->nv, of->nf + of->pairs};
+    search at = {core, of, s, in, of->metric ? in->w : s->v, of->nv, of->nf + of->pairs};
     for (int i = 0; i < at.m; i++) {
         int side = s->active[i];
         if (side && (fabs(bound_of(of, i, side)) >= NONE || (i >= of->nf && side > 0)))

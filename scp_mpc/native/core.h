@@ -178,8 +178,17 @@ typedef struct {
 
 /* ---- programs: active_set.py */
 
+/* Coordinates in which another Hessian is the identity: v = origin + back w, where back is L^-T or
+ * I + V'diag(stretch) V. */
+typedef struct {
+    const double *origin;         /* (nv,) */
+    const double *L;              /* (nv, nv) lower Cholesky factor of the Hessian, or NULL */
+    const double *V, *stretch;    /* (q, nv), (q,) */
+    int q;
+} metric;
+
 /* minimise |w|^2 / 2 subject to lower <= F v <= upper, A v >= b, where v = w, or where there is
- * another metric, v = origin + back w. Rows are made when they are asked for. */
+ * another metric, as that says. Rows are made when they are asked for. */
 typedef struct {
     int nv, nf, pairs, d, n;
     const double *F;              /* (nf, nv): S from `boxed` on */
@@ -190,8 +199,7 @@ typedef struct {
     const double *b;              /* (pairs,) */
     const double *l1_weight;      /* (nf + pairs,) largest forces, infinite where none yields; NULL: none may */
     double least;                 /* cost at v = 0 */
-    const double *back;           /* (nv, nv) symmetric or NULL */
-    const double *origin;         /* (nv,) or NULL */
+    const metric *metric;         /* NULL: v = w */
 } qp;
 
 /* The solution of a program. In `force`, `active` and `relaxed` bounds come first, then pairs. */

@@ -280,6 +280,8 @@ static const solution *newton_step(scp_core *core, const program *p, const solut
     double *B = doubles(&core->scratch, (size_t)(k * nv));
     double *z = doubles(&core->scratch, (size_t)nv);
     double *pull = doubles(&core->scratch, (size_t)nv);
+    double *T = doubles(&core->scratch, (size_t)(nv * nv));
+    double *across = doubles(&core->scratch, (size_t)(k * k));
     double *inner = doubles(&core->scratch, (size_t)k);
     memcpy(M, W, (size_t)(nv * nv) * sizeof *M);
     for (int i = 0; i < nv; i++) {
@@ -287,21 +289,21 @@ static const solution *newton_step(scp_core *core, const program *p, const solut
         z[i] = -left[i];
     }
     orthonormal(nv, s, R);
-    /* P M P + R'R = M - R'B - B'R with B = R M - (R M R' + I) R / 2, or what adds up to the same */
-    for (int a = 0; a < k; a++) {
-        gemv(nv, nv, M, R + a * nv, B + a * nv);
-        axpy(nv, -dot(nv, R + a * nv, z), R + a * nv, z);
-    }
-    for (int a = 0; a < k; a++) {
-        gemv(k, nv, R, B + a * nv, inner);
-        for (int b = a; b < k; b++)
-            axpy(nv, -(inner[b] + (a == b)) / (a == b ? 2 : 1), R + b * nv, B + a * nv);
-    }
     for (int a = 0; a < k; a++)
-        for (int i = 0; i < nv; i++) {
-            axpy(i + 1, -R[a * nv + i], B + a * nv, M + i * nv);
-            axpy(i + 1, -B[a * nv + i], R + a * nv, M + i * nv);
-        }
+        axpy(nv, -dot(nv, R + a * nv, z), R + a * nv, z);
+    /* P M P + R'R = M - R'B - B'R with B = R M - (R M R' + I) R / 2 */
+    gemm(k, nv, nv, R, M, B);
+    gemm_nt(k, nv, k, B, R, across);
+    for (int a = 0; a < k; a++)
+        across[a * k + a] += 1.0;
+    scale(k * k, -0.5, across);
+    for (int a = 0; a < k; a++)
+        for (int b = 0; b < k; b++)
+            axpy(nv, across[a * k + b], R + b * nv, B + a * nv);
+    gemm_tn(k, nv, nv, R, B, T);
+    for (int i = 0; i < nv; i++)
+        for (int j = 0; j <= i; j++)
+            M[i * nv + j] -= T[i * nv + j] + T[j * nv + i];
     solution *whole = NULL;
     if (!cholesky(nv, M)) {
         whole = borrowed(core->newton, nv, s, p->qp.nf + p->qp.pairs);
@@ -321,42 +323,18 @@ static const solution *newton_step(scp_core *core, const program *p, const solut
 
 /* ---- where the active set changes on the way */
 
-/* back = I + V diag(stretch) V' with `values` of the Hessian along the rows of V (q, nv). */
-static void stretch(int nv, int q, const double *values, const double *V, double *back)
-{
-    memset(back, 0, (size_t)(nv * nv) * sizeof *back);
-    for (int i = 0; i < nv; i++)
-        back[i * nv + i] = 1.0;
-    for (int k = 0; k < q; k++) {
-        double more = 1 / sqrt(fmax(values[k], FLAT)) - 1;
-        const double *row = V + k * nv;
-        for (int i = 0; i < nv; i++)
-            axpy(nv, more * row[i], row, back + i * nv);
-    }
-}
-
-/* Solve a program again with the Lagrangian's own Hessian H = C^2; NULL where that is not reached.
- * The objective is |w|^2 / 2 in w = C (v - here) + C^-1 here; back (nv, nv) is C^-1. */
-static const solution *newton_program(scp_core *core, const program *p, const double *back,
+/* Solve a program again with the Lagrangian's own Hessian H = C'C; NULL where that is not reached.
+ * The objective is |w|^2 / 2 in w = C (v - here) + C^-T here, and origin (nv,) is here - H^-1 here. */
+static const solution *newton_program(scp_core *core, const program *p, const metric *by,
                                       const solution *from)
 {
-    int nv = core->at.nv, all = p->qp.nf + p->qp.pairs, systems = 0;
+    int all = p->qp.nf + p->qp.pairs, systems = 0;
     solution *to = &((newton_room *)core->newton)->turned;
-    size_t mark = core->scratch.used;
-    double *once = doubles(&core->scratch, (size_t)nv);
-    double *origin = doubles(&core->scratch, (size_t)nv);
     qp turned = p->qp;
-    gemv(nv, nv, back, p->c.here, once);
-    gemv(nv, nv, back, once, origin);
-    for (int i = 0; i < nv; i++)
-        origin[i] = p->c.here[i] - origin[i];
-    turned.back = back;
-    turned.origin = origin;
+    turned.metric = by;
     memcpy(to->active, from->active, (size_t)all * sizeof *to->active);
     memcpy(to->relaxed, from->relaxed, (size_t)all * sizeof *to->relaxed);
-    qp_end end = settle(core, &turned, to, CHANGES, INFINITY, &systems);
-    core->scratch.used = mark;
-    return end == QP_SOLVED ? to : NULL;
+    return settle(core, &turned, to, CHANGES, INFINITY, &systems) == QP_SOLVED ? to : NULL;
 }
 
 /* By Newton's step on its active set, or else with one that changes: of few curvature factors. */
@@ -364,6 +342,7 @@ static const solution *refine_few(scp_core *core, const program *p, const soluti
 {
     int nv = core->at.nv;
     arena *scratch = &core->scratch;
+    const double *here = p->c.here;
     double *F = doubles(scratch, (size_t)(q * nv));
     double *turned = doubles(scratch, (size_t)q);
     factors_of(core, p, s->force + p->qp.nf, s->v, F, turned);
@@ -373,19 +352,49 @@ static const solution *refine_few(scp_core *core, const program *p, const soluti
     double *gram = doubles(scratch, (size_t)(q * q));
     double *vectors = doubles(scratch, (size_t)(q * q));
     double *V = doubles(scratch, (size_t)(q * nv));
-    double *back = doubles(scratch, (size_t)(nv * nv));
+    double *origin = doubles(scratch, (size_t)nv);
     gemm_nt(q, nv, q, F, F, gram);
     if (eigen(q, gram, turned, vectors, scratch))
         return s;
     gemm_tn(q, q, nv, vectors, F, V);
-    for (int k = 0; k < q; k++) {
-        double root = norm2(nv, V + k * nv);
+    memset(origin, 0, (size_t)nv * sizeof *origin);
+    for (int k = 0; k < q; k++) { /* 1 - roots are H's eigenvalues, rows of V its eigenvectors */
+        double root = norm2(nv, V + k * nv), value = fmax(1.0 - turned[k], FLAT);
         scale(nv, root > 0 ? 1 / root : 0.0, V + k * nv);
-        turned[k] = 1.0 - turned[k];
+        axpy(nv, (1 - 1 / value) * dot(nv, V + k * nv, here), V + k * nv, origin);
+        turned[k] = 1 / sqrt(value) - 1;
     }
-    stretch(nv, q, turned, V, back);
-    const solution *end = newton_program(core, p, back, s);
+    metric by = {.origin = origin, .V = V, .stretch = turned, .q = q};
+    const solution *end = newton_program(core, p, &by, s);
     return end != NULL ? end : s;
+}
+
+/* Cholesky factor of I + W, curvature that is negative or small replaced; 0, or no numbers. */
+static int factorise(scp_core *core, const double *W, double *L)
+{
+    int nv = core->at.nv, failed = 0;
+    size_t mark = core->scratch.used, size = (size_t)(nv * nv);
+    double *H = doubles(&core->scratch, size);
+    double *values = doubles(&core->scratch, (size_t)nv);
+    double *vectors = doubles(&core->scratch, size);
+    memcpy(L, W, size * sizeof *L);
+    for (int i = 0; i < nv; i++)
+        L[i * nv + i] += 1.0 - FLAT;
+    int flat = cholesky(nv, L);
+    memcpy(L, W, size * sizeof *L);
+    memcpy(H, W, size * sizeof *H);
+    if (flat)
+        failed = eigen(nv, H, values, vectors, &core->scratch);
+    for (int k = 0; flat && !failed && k < nv && 1.0 + values[k] < FLAT; k++) {
+        double more = FLAT - 1.0 - values[k];
+        for (int i = 0; i < nv; i++)
+            for (int j = 0; j <= i; j++)
+                L[i * nv + j] += more * vectors[i * nv + k] * vectors[j * nv + k];
+    }
+    for (int i = 0; i < nv; i++)
+        L[i * nv + i] += 1.0;
+    core->scratch.used = mark;
+    return failed || cholesky(nv, L);
 }
 
 /* The same with all of W, which `left` = W d belongs to. */
@@ -393,24 +402,20 @@ static const solution *refine_all(scp_core *core, const program *p, const soluti
                                   const double *left, const double *W)
 {
     int nv = core->at.nv;
-    arena *scratch = &core->scratch;
     const solution *whole = newton_step(core, p, s, left, W);
     if (whole != NULL && holds(core, &p->qp, whole))
         return whole;
-    double *copy = doubles(scratch, (size_t)(nv * nv));
-    double *values = doubles(scratch, (size_t)nv);
-    double *vectors = doubles(scratch, (size_t)(nv * nv));
-    double *back = doubles(scratch, (size_t)(nv * nv));
-    memcpy(copy, W, (size_t)(nv * nv) * sizeof *copy);
-    if (eigen(nv, copy, values, vectors, scratch))
+    double *L = doubles(&core->scratch, (size_t)(nv * nv));
+    double *origin = doubles(&core->scratch, (size_t)nv);
+    if (factorise(core, W, L))
         return s;
-    for (int i = 0; i < nv; i++) { /* eigenvectors in rows */
-        values[i] += 1.0;
-        for (int j = 0; j < nv; j++)
-            copy[i * nv + j] = vectors[j * nv + i];
-    }
-    stretch(nv, nv, values, copy, back);
-    const solution *end = newton_program(core, p, back, s);
+    memcpy(origin, p->c.here, (size_t)nv * sizeof *origin);
+    solve_lower(nv, L, origin);
+    solve_lower_t(nv, L, origin);
+    for (int i = 0; i < nv; i++)
+        origin[i] = p->c.here[i] - origin[i];
+    metric by = {.origin = origin, .L = L};
+    const solution *end = newton_program(core, p, &by, s);
     return end != NULL ? end : s;
 }
 
