@@ -6,10 +6,10 @@
  *
  *     D' nu = phi_e - 2 Q e,     then in the inputs     2 R u - B' nu - phi_u = 0
  *
- * has to hold, and for sizes that move 2 w (s - s_ref) - phi_s = 0. A point where all this holds may
- * still be a saddle. So the Lagrangian's second derivative must not bend down in any direction in
- * which the strongly active constraints allow to move, to first order, and the weakly active ones
- * too.
+ * has to hold, and for sizes that move 2 w (s - s_ref) - phi_s = 0. A point where all this holds
+ * may still be a saddle. So the Lagrangian's second derivative must not bend down in any direction
+ * in which the strongly active constraints allow to move, to first order, and the weakly active
+ * ones too.
  *
  *     lambda      (count,) forces on the pairs of obstacle and node, non-negative
  *     beta        (nf,)   forces of the bounds, positive at lower ones: the reaction
@@ -19,12 +19,12 @@
  */
 #include "core.h"
 
-static const double STRONG = 1e-6;     /* force, of the largest, from which it is strongly active */
+static const double STRONG = 1e-6;     /* force, of the largest: strongly active */
 static const double TOUCH = 1e-7;      /* distance to a constraint that is none */
 static const double DEPENDENT = 1e-12; /* square of what is left of a row, of the largest: none */
 static const double LEAST = 1e-300;
-static const double ROUNDING = 1e-10;  /* of a bounded state beyond its bounds, which costs nothing */
-static const double FLAT = 1e-6;       /* of the largest curvature: what is less is taken for flat */
+static const double ROUNDING = 1e-10;  /* of a state beyond its bounds, which costs nothing */
+static const double FLAT = 1e-6;       /* of the largest curvature: what is less is flat */
 
 void lay_out_certificate(scp_core *core, arena *from)
 {
@@ -81,7 +81,8 @@ void track_of(const scp_core *core, const double *e, double *track)
     }
 }
 
-void phi_of(const scp_core *core, const pairs *of, const planes *at, const double *force, double *phi)
+void phi_of(const scp_core *core, const pairs *of, const planes *at, const double *force,
+            double *phi)
 {
     int d = core->at.d;
     memset(phi, 0, (size_t)core->at.ny * sizeof(double));
@@ -217,7 +218,8 @@ static void judge_bounds(scp_core *core, nominal *n, relaxation level, double *f
         double below = n->y[k] - core->lower[k], above = core->upper[k] - n->y[k];
         if (limits) {
             double beyond = larger(0, -(above < below ? above : below));
-            double wide = below < 0 ? core->lower[k] - wide_lower[k] : wide_upper[k] - core->upper[k];
+            double low = core->lower[k] - wide_lower[k], high = wide_upper[k] - core->upper[k];
+            double wide = below < 0 ? low : high;
             allowed = wide < beyond ? wide : beyond;
             if (z >= 0) {
                 n->excess[z] = beyond > ROUNDING ? beyond : 0;
@@ -378,10 +380,10 @@ static double smallest(scp_core *core, int nv, const double *W, int q, const dou
 }
 
 /* Necessary at a minimum is that no direction of the critical cone bends down. The strongly active
- * rows take directions away altogether. Of the weakly active ones only half of the directions may be
- * gone: where they are free and some direction bends down, it counts if it or its opposite moves away
- * from all of them; else they are held. Rows (k, nv) point towards where they allow to go; their
- * forces (k,) are not negative. */
+ * rows take directions away altogether. Of the weakly active ones only half of the directions may
+ * be gone: where they are free and some direction bends down, it counts if it or its opposite moves
+ * away from all of them; else they are held. Rows (k, nv) point towards where they allow to go;
+ * their forces (k,) are not negative. */
 double least_curvature(scp_core *core, int nv, const double *W, int q, const double *factors, int k,
                        const double *rows, const double *force, double *direction)
 {

@@ -332,7 +332,7 @@ static size_t scratch_of(const scp_core *core)
         scratch_of_step,          scratch_of_linalg,     scratch_of_nodes,  scratch_of_condensing,
         scratch_of_certificate,   scratch_of_loop,       scratch_of_newton, scratch_of_start,
         scratch_of_transcription, scratch_of_candidates, scratch_of_solver, scratch_of_multi_start,
-        scratch_of_fallback,      scratch_of_backup,     scratch_of_controller};
+        scratch_of_fallback,      scratch_of_backup,     scratch_of_riccati, scratch_of_controller};
     size_t sum = 4096; /* and what alignment takes */
     for (size_t k = 0; k < sizeof parts / sizeof *parts; k++)
         sum += parts[k](core) + 1024;

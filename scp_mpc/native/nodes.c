@@ -9,8 +9,8 @@
  *
  *     r' = sqrt((r + b)^2 + (l/2)^2)      with l and b of that interval
  *
- * The nodes of a backup may reach beyond the horizon: a model is asked for so many intervals at once
- * as the horizon has.
+ * The nodes of a backup may reach beyond the horizon: a model is asked for as many intervals at
+ * once as the horizon has.
  */
 #include "core.h"
 
@@ -115,7 +115,8 @@ static void positions_at(const scp_core *core, nodes of, const double *X, const 
     double *after = doubles(room, (size_t)(N * nx));
     for (int first = 0; first < of.N; first += N) {
         int count = of.N - first < N ? of.N - first : N;
-        const double *x = within_intervals(core, count, X + first * nx, U + first * nu, share, after);
+        const double *x = X + first * nx;
+        x = within_intervals(core, count, x, U + first * nu, share, after);
         for (int i = 0; i < count; i++, x += nx, p += apart)
             bodies(core, x, p);
     }
@@ -134,7 +135,7 @@ void nodes_positions(const scp_core *core, nodes of, const double *X, const doub
         positions_at(core, of, X, U, (double)k / of.K, m + part, p + (k - 1) * part);
 }
 
-/* C (m, nx) and D (m, nu) of the positions (n, d) after a share of an interval: slopes times A, B */
+/* C (m, nx) and D (m, nu) of positions (n, d) after a share of an interval: slopes times A, B */
 static void chained(const scp_core *core, const double *slopes, const double *A, const double *B,
                     double *C, double *D)
 {

@@ -4,8 +4,8 @@
  * by the classical Runge-Kutta method, with derivatives of its formulas, not of the flow that they
  * approximate; and whatever the caller's functions say.
  *
- *     unicycle    x = [p1, p2, theta, v],         u = [a, omega],   mu = omega h / 2, alpha = a h / 2
- *     bicycle     x = [p1, p2, theta, v, delta],  u = [a, sigma],   omega = v tan(delta) / L
+ *     unicycle    x = [p1, p2, theta, v],        u = [a, omega], mu = omega h / 2, alpha = a h / 2
+ *     bicycle     x = [p1, p2, theta, v, delta], u = [a, sigma], omega = v tan(delta) / L
  *     h           time advanced [s]: a share of dt
  *     z = (x, u)  state and held input together
  *     j_n         spherical Bessel functions
@@ -164,7 +164,7 @@ static void unicycle_curvature(const double *x, const double *u, const double *y
 /* ---- bicycle: x' = g(x, u) by Runge-Kutta. Of g only p1, p2 and theta are curved, and only in
  * theta, v and delta; v and delta grow evenly. */
 
-enum { X = 5, Z = 7, BENT = 5 }; /* states; with inputs; those that matter: theta, v, delta, a, sigma */
+enum { X = 5, Z = 7, BENT = 5 }; /* states; with inputs; of these theta, v, delta, a and sigma */
 
 static const double nodes_at[4] = {0.0, 0.5, 0.5, 1.0};
 static const double weights[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
