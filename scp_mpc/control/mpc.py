@@ -151,15 +151,14 @@ class MPC:
         """
         native = self._solver.native
         if native is not None:
-            given = x0, x_ref, obstacles, time, robot_covariance, u_last
-            return self._native_step(native, perf_counter(), *given)
+            return self._native_step(
+                *(native, perf_counter(), x0, x_ref, obstacles, time, robot_covariance, u_last)
+            )
         clock = self._solver.timed(self._deadline)
         self._enter()
         try:
             recall = self._memory.recall(time, obstacles)
-            last = self._applied if self.problem.limits_rates else None
-            if u_last is not None:
-                last = as_array("u_last", u_last, (self.problem.model.nu,))
+            last = self._last_input(u_last)
             known = len(recall.obstacles)
             if known > self.problem.max_obstacles:
                 recall = recall._replace(obstacles=self._chosen(x0, x_ref, recall.obstacles, last))
@@ -168,8 +167,8 @@ class MPC:
             ahead = bool(recall.obstacles) or self._backups.always
             if recall.stale is None and ahead and clock.allows("backup"):
                 with clock.task("backup"):
-                    known_ones = recall.obstacles
-                    plan, backup = self._backed(plan, x0, x_ref, known_ones, robot_covariance, last)
+                    given = x0, x_ref, recall.obstacles, robot_covariance, last
+                    plan, backup = self._backed(plan, *given)
                 plan = replace(plan, timing=replace(plan.timing, total=clock.elapsed()))
             sound = self._within(plan, last)
             if not sound:
@@ -224,6 +223,12 @@ class MPC:
         paths = np.stack([ahead, backup])[..., problem.model.position]
         return most_dangerous(obstacles, paths, problem.max_obstacles)
 
+    def _last_input(self, u_last: ArrayLike | None) -> FloatArray | None:
+        """The input (nu,) from which the first rate counts; None for unknown, or none that does."""
+        if u_last is not None:
+            return as_array("u_last", u_last, (self.problem.model.nu,))
+        return self._applied if self.problem.limits_rates else None
+
     def _tell(self, left_out: int) -> None:
         """Say once that some of the known obstacles are left out."""
         if left_out and not self._left_out:
@@ -251,17 +256,17 @@ class MPC:
             recall = self._memory.recall(time, obstacles)
             left_out = max(len(recall.obstacles) - self.problem.max_obstacles, 0)
             if left_out:
-                last = None if u_last is None else as_array("u_last", u_last)
+                last = self._last_input(u_last)
                 recall = recall._replace(obstacles=self._chosen(x0, x_ref, recall.obstacles, last))
             if recall.stale is None:
                 given = x0, x_ref, recall.obstacles, robot_covariance, u_last
                 plan = native.step(began, *given, left_out)
             else:
                 self._require_brakeable(x0, x_ref, recall, robot_covariance)
-                plan = native.brake(began, x0, x_ref, u_last)
+                plan = native.brake(began, x0, x_ref, u_last, left_out)
             self._tell(left_out)
             self._memory.commit(recall)
-            self._made, self._obstacles = plan, recall.obstacles
+            self._made, self._applied, self._obstacles = plan, plan.u0, recall.obstacles
             self._counts[plan.status] += 1
             self.replayed = native.core.outputs.replayed
             if self._deadline is not None and plan.timing.total > self._deadline:

@@ -238,12 +238,17 @@ class NativeEngine:
         return self._plan(given, self.core.step(), began, wrote, left_out=left_out)
 
     def brake(
-        self, began: float, x0: ArrayLike, x_ref: ArrayLike, u_last: ArrayLike | None
+        self,
+        began: float,
+        x0: ArrayLike,
+        x_ref: ArrayLike,
+        u_last: ArrayLike | None = None,
+        left_out: int = 0,
     ) -> Plan:
-        """A step of the controller without predictions, for they are too old."""
+        """`step` without predictions, for they are too old."""
         given = self._write(x0, x_ref, (), None, u_last)
         wrote = perf_counter()
-        return self._plan(given, self.core.brake(), began, wrote, Status.STALE)
+        return self._plan(given, self.core.brake(), began, wrote, Status.STALE, left_out)
 
     def _plan(
         self,

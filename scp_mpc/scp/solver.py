@@ -13,6 +13,8 @@
 
 Between the nodes of a plan radii leave room for what its motion there is assumed to be; a plan that
 moves otherwise is sought again, with what it does for the assumption.
+
+With `Settings(solver="native")` the core in C does all that, `native.py`.
 """
 
 import logging

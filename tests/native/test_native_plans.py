@@ -283,9 +283,11 @@ def test_predictions_that_are_too_old():
     controllers = [MPC(this, replace(s, **settings)) for s in (NATIVE, OSQP)]
     x, goal, obstacles = np.array([0.0, 1.0, 0.0, 0.0]), *ahead(this)[1:]
     for k, stamp in enumerate((0.0, 0.2, 0.2, 0.2, 0.8, 1.0)):
-        given = ObstaclePredictions(obstacles.means, 0.01 * np.eye(2), 0.2, stamp=stamp)
+        means = np.concatenate([obstacles.means, obstacles.means + 3.0])  # one too many
+        given = ObstaclePredictions(means, 0.01 * np.eye(2), 0.2, stamp=stamp)
         native, loop = (mpc.step(x, goal, given, time=0.2 * k) for mpc in controllers)
         same(native, loop, 1e-6)
+        assert native.left_out == loop.left_out == 1
         x = this.model.step(x, loop.u0)
     assert controllers[0].counts == controllers[1].counts
     assert controllers[0].counts[Status.STALE] == 1
