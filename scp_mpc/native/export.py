@@ -28,7 +28,14 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _STEPS = 12
 
 
-def export(problem: Problem, settings: Settings, folder: str | Path, name: str = "robot") -> Path:
+def export(
+    problem: Problem,
+    settings: Settings,
+    folder: str | Path,
+    name: str = "robot",
+    *,
+    polytopes: bool = True,
+) -> Path:
     """Write a controller in C99 for one problem; it needs nothing but the mathematical library.
 
     The folder gets the core's sources, the problem's and the settings' numbers in
@@ -41,6 +48,8 @@ def export(problem: Problem, settings: Settings, folder: str | Path, name: str =
         settings: How to solve it; `solver`, `qp`, `history` and `staleness` have no meaning there.
         folder: Made if it is not there; files of the same names are replaced.
         name: Of the package, its library and its functions: small letters, digits, underscores.
+        polytopes: Make room for obstacles that are polytopes, of up to 16 corners and 16 faces.
+            Where all are round, less memory will do.
 
     Returns:
         The folder.
@@ -58,9 +67,12 @@ def export(problem: Problem, settings: Settings, folder: str | Path, name: str =
         raise InvalidArgumentError("name", f"{name!r} is no name in small letters")
     deadline = settings.time_limit(problem.model.dt)
     values = constants(problem, settings, deadline)
+    if not polytopes:
+        values |= dict.fromkeys(("max_shapes", "max_corners", "max_faces", "max_edges"), 0)
+    box = Polytope.box(np.full(problem.model.dim, 0.5)) if polytopes else None
     own = values["model"] == OWN_MODEL
     model = _model(problem.model, name) if own else ""
-    core = NativeCore(problem, settings)
+    core = NativeCore(problem, settings, room=[box])
     words = {
         "name": name,
         "NAME": name.upper(),
@@ -77,7 +89,7 @@ def export(problem: Problem, settings: Settings, folder: str | Path, name: str =
         **{f"src/{p.name}": p.read_text("utf-8") for p in sorted(_HERE.glob("*.[ch]"))},
         "include/scp_mpc.h": (_HERE / "scp_mpc.h").read_text("utf-8"),
         "vectors/vectors.h": _VECTORS,
-        "vectors/vectors.c": _steps(problem, core),
+        "vectors/vectors.c": _steps(problem, core, box),
         "vectors/replay.c": _template("replay.c", words),
         **{f: _template(f, words) for f in ("main.c", "README.md", "Config.cmake.in")},
     }
@@ -213,11 +225,11 @@ def _model(model: Model, name: str) -> str:
     return "".join([code.source, *parts, last])
 
 
-def _steps(problem: Problem, core: "NativeCore") -> str:
+def _steps(problem: Problem, core: "NativeCore", box: Polytope | None) -> str:
     """The C file of control steps past made-up obstacles, and what the core makes of them."""
     model, N, views = problem.model, problem.horizon, core.views
     J, rng = min(problem.max_obstacles, 4), np.random.default_rng(0)
-    box = Polytope.box(np.full(model.dim, 0.5)) if J > 1 else None
+    box = box if J > 1 else None
     ahead, aside = np.eye(model.dim)[:2]
     core.inputs.count = J
     core.set_shapes([box if j == 1 else None for j in range(J)])

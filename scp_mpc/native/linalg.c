@@ -15,13 +15,29 @@
 
 enum { ALIGNED = 64 };
 
+#ifdef SCP_POISON /* for tests with AddressSanitizer: what is between two arrays is nobody's */
+void __asan_poison_memory_region(const volatile void *begin, size_t size);
+void __asan_unpoison_memory_region(const volatile void *begin, size_t size);
+
+static void *owned(char *begin, size_t size)
+{
+    __asan_unpoison_memory_region(begin, size);
+    __asan_poison_memory_region(begin + size, (ALIGNED - size % ALIGNED) % ALIGNED);
+    return begin;
+}
+#else
+#define owned(begin, size) (begin)
+#endif
+
 void *take(arena *from, size_t count, size_t size)
 {
     size_t begin = (from->used + ALIGNED - 1) / ALIGNED * ALIGNED;
     from->used = begin + count * size;
     if (from->used > from->most)
         from->most = from->used;
-    return from->base && from->used <= from->size ? from->base + begin : NULL;
+    if (!from->base || from->used > from->size)
+        return NULL;
+    return owned(from->base + begin, count * size);
 }
 
 double *doubles(arena *from, size_t count)
