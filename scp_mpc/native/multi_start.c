@@ -32,6 +32,7 @@ typedef struct {
     double merit;     /* of its optimum; infinite if it has no solution, or none that can win */
     int looked, wins; /* whether there was time for it, and whether it may win */
     int waits, varied;
+    int yields;       /* whether obstacles do in its program */
     double *path;     /* (C, d) */
     double *v;        /* (nv,) */
     double *force;    /* (nf + M C,) */
@@ -125,7 +126,7 @@ size_t scratch_of_multi_start(const scp_core *core)
     const layout *at = &core->at;
     size_t path = (size_t)((at->nodes.size + 1) * at->d), slots = (size_t)at->most_pairs;
     size_t reals = 2 * path + (size_t)(at->ny + at->nf) + slots + SCP_MOST_CANDIDATES;
-    return reals * sizeof(double) + 2 * slots + 10 * 64;
+    return reals * sizeof(double) + 3 * slots + (size_t)at->nf + 10 * 64;
 }
 
 /* ---- memory of the alternatives */
@@ -369,6 +370,20 @@ static qp_end settle_one(scp_core *core, const double *known, double limit)
     return settle(core, &p->qp, s, MOST_CHANGES, limit, &systems);
 }
 
+/* Whether obstacles yield at the solution of a program. */
+static int yields(scp_core *core, const qp *of, const solution *s)
+{
+    size_t mark = core->scratch.used;
+    double *depth = doubles(&core->scratch, (size_t)(of->nf + of->pairs));
+    int8_t *side = take(&core->scratch, (size_t)(of->nf + of->pairs), sizeof *side);
+    int any = 0;
+    violations(core, of, s->v, depth, side);
+    for (int k = of->nf; k < of->nf + of->pairs; k++)
+        any |= s->relaxed[k] && depth[k] > core->p.tolerance;
+    core->scratch.used = mark;
+    return any;
+}
+
 /* Look at one program; `known` multipliers of the step before may be NULL. */
 static void look(scp_core *core, relaxation level, double limit, const double *known, ranked *one)
 {
@@ -383,6 +398,7 @@ static void look(scp_core *core, relaxation level, double limit, const double *k
     one->looked = 1;
     one->merit = end == QP_SOLVED ? qp_merit(core, &p->qp, s->v) : INFINITY;
     one->wins = one->merit <= limit && isfinite(one->merit);
+    one->yields = level == RELAX_ALL && one->wins && yields(core, &p->qp, s);
     if (one->wins)
         memcpy(one->v, s->v, (size_t)core->at.nv * sizeof(double));
     else
@@ -571,7 +587,7 @@ static void follow(scp_core *core, int count, ranked *const *order, int most, in
         int wanted = safe ? k < most : k < MOST_FOLLOWED && !is_ok(best->status);
         if (one->waits || (safe && !wanted && k < MOST_PROMISING))
             wanted = one->merit <= PROMISING * best->merit;
-        if (!one->wins || !wanted)
+        if (!one->wins || !wanted || (core->linear && one->yields)) /* its first program has none */
             continue;
         if (!allows(core, TASK_ITERATION))
             break;
