@@ -190,7 +190,8 @@ class Acados:
         return self._data.S
 
     def reset(self) -> None:
-        """Forget the last plan."""
+        """Forget the last plan, and what HPIPM remembers of it."""
+        self._library.peer_reset(ctypes.c_void_p(self._solver))
         self._began = False
 
     def solve(

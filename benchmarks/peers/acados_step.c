@@ -49,6 +49,11 @@ void peer_free(void *capsule)
     peer_acados_free_capsule(capsule);
 }
 
+void peer_reset(void *capsule)
+{
+    peer_acados_reset(capsule, 1);
+}
+
 static void describe(const double *mean, const double *Sigma, double radius, double *p)
 {
     const double middle = 0.5 * (Sigma[0] + Sigma[3]);
