@@ -14,6 +14,7 @@ from native import needs_core
 from typer.testing import CliRunner
 
 from scp_mpc import (
+    DoubleIntegrator,
     FunctionModel,
     InvalidArgumentError,
     PlanarQuadrotor,
@@ -274,3 +275,12 @@ def test_the_command_says_in_one_line_what_is_wrong(text, message, tmp_path, mon
     assert message in result.output
     assert result.output.startswith("error: ")
     assert not (tmp_path / "out").exists()
+
+
+@needs_core
+@pytest.mark.parametrize(("nodes", "most"), [(1, 2e6), (4, 4.5e6)])
+def test_memory_is_small(nodes, most, tmp_path):
+    twelve = problem(DoubleIntegrator(0.2), horizon=30, max_obstacles=12, nodes_per_interval=nodes)
+    export(twelve, SETTINGS, tmp_path, polytopes=False)
+    header = (tmp_path / "include" / "robot.h").read_text()
+    assert int(re.search(r"ROBOT_BYTES = (\d+)", header)[1]) < most
