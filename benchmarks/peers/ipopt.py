@@ -11,7 +11,7 @@ normal: some theta meets the constraint just where p is outside. So the lifting 
 
 import warnings
 from collections.abc import Sequence
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ class Ipopt:
         guess: Trajectory | Iterate,
     ) -> PeerPlan:
         """Plan from the state x0; arguments as for `SCP.solve`."""
-        began = perf_counter()
+        began, worked = perf_counter(), thread_time()
         problem, unknowns = self.problem, self._unknowns
         step, sets = read(problem, x0, x_ref, obstacles)
         nominal = as_iterate(guess, problem)
@@ -111,6 +111,7 @@ class Ipopt:
             obstacles,
             point,
             seconds=perf_counter() - began,
+            processor=thread_time() - worked,
             ok=bool(stats["success"]),
             message=str(stats["return_status"]),
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import nan
 from typing import Protocol
 
 from numpy.typing import ArrayLike
@@ -38,6 +39,7 @@ class PeerPlan:
         ok: Whether the solver itself reported success.
         message: What it reported.
         qps: Quadratic programs by the solver that finished them; empty if it does not tell.
+        processor: Seconds of processor time of the solve; NaN if nobody looked.
     """
 
     X: FloatArray
@@ -49,6 +51,7 @@ class PeerPlan:
     ok: bool
     message: str
     qps: Mapping[str, int] = field(default_factory=dict)
+    processor: float = nan
 
     @classmethod
     def judged(
@@ -61,6 +64,7 @@ class PeerPlan:
         seconds: float,
         ok: bool,
         message: str,
+        processor: float = nan,
     ) -> "PeerPlan":
         """Add cost and violation to the states, inputs and sizes of all slots in `point`."""
         states, inputs, s = point
@@ -74,6 +78,7 @@ class PeerPlan:
             seconds=seconds,
             ok=ok,
             message=message,
+            processor=processor,
         )
 
 

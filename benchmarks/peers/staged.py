@@ -10,7 +10,7 @@ Notation:
 """
 
 from collections.abc import Sequence
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ class Staged:
         guess: Trajectory | Iterate,
     ) -> PeerPlan:
         """Plan from the state x0; arguments as for `SCP.solve`."""
-        began = perf_counter()
+        began, worked = perf_counter(), thread_time()
         problem = self.problem
         model, N, M = problem.model, problem.horizon, problem.max_obstacles
         step, sets = read(problem, x0, x_ref, obstacles)
@@ -119,6 +119,7 @@ class Staged:
             obstacles,
             (end[:, : model.nx], parts[:, model.nx + M :], end[-1, model.nx :]),
             seconds=perf_counter() - began,
+            processor=thread_time() - worked,
             ok=ok,
             message=message,
         )

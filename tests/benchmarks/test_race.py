@@ -26,7 +26,8 @@ class Stub:
         self._count += 1
         seconds = next(TIMES) if self._count else 0.0
         s = np.full(len(given.radii), 2.0)
-        return Planned(seconds, plan.X, plan.U, s, ok=self._count != 3, shaped=self._count % 2 == 0)
+        told = {"ok": self._count != 3, "shaped": self._count % 2 == 0}
+        return Planned(seconds, 0.5 * seconds, plan.X, plan.U, s, **told)
 
     def reset(self):
         self._count = 0
@@ -48,6 +49,7 @@ def stub(monkeypatch):
 def test_least_and_plain_times_by_hand(tmp_path):
     mine, ghost = rows(3, repeats=2, courses=SHORT, store=tmp_path / "race.jsonl")
     assert mine["least_us"] == pytest.approx({"median": 1e3, "p99": 3.94e3, "max": 4e3})
+    assert mine["processor_us"]["max"] == pytest.approx(2e3)
     assert mine["plain_us"]["median"] == pytest.approx(2.5e3)
     assert mine["plain_us"]["max"] == pytest.approx(6e3)
     assert (mine["steps"], mine["repeats"], mine["failures"]) == (3, 2, 1)
@@ -63,7 +65,7 @@ def test_least_and_plain_times_by_hand(tmp_path):
     assert mine["cost"] == pytest.approx(cost)
     assert ghost["missing"] == "ghost is not installed; nobody has seen it at N = 8"
     text = markdown([mine, ghost])
-    assert "| N = 8 | stub | 1,000 | 3,940 | 4,000 | 1,000 in 1 steps | 2,500 |" in text
+    assert "| N = 8 | stub | 1,000 / 3,940 / 4,000 | 500 / 1,970 / 2,000 | 1,000 in 1 steps" in text
     assert "Without ghost (N = 8): ghost is not installed; nobody has seen it at N = 8." in text
 
 
