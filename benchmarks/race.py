@@ -14,7 +14,7 @@ a long step costs: its processor time is. An interrupted race goes on where it s
     scp_mpc, native    the core in C, all ways past the obstacles
     scp_mpc, osqp      the loop in Python with OSQP, likewise
     acados             SQP to 1e-6, and its real-time iteration; keeps its side (`peers/acados.py`)
-    ipopt, fatrop      keep their side; linear robots only; their inputs are checked for them
+    ipopt, fatrop      keep their side; linear robots only; predictions are checked before the clock
 
 A plan that an engine disowns is not applied: the last one is, shifted. In the plane obstacles of
 crowds and circuits have round covariances, where both inflations are the same: all take "axes".
