@@ -549,6 +549,8 @@ int relaxes(scp_core *core, relaxation *level, int hard);
 void write_program(scp_core *core, const nominal *about, const condensed *c, const planes *at,
                    relaxation level, const double *radius, program *to);
 void guess_active(const program *p, const double *reaction, const double *force, solution *to);
+void guess_nothing(const program *p, solution *to);
+qp_end settle_in_time(scp_core *core, const program *p, int changes, double limit, solution *to);
 program_end solve_program(scp_core *core, const program *p, const nominal *from, solution *to);
 void certified(scp_core *core, const program *p, const solution *s, nominal *to);
 void states_of(const scp_core *core, const rollout *roll, double *X);

@@ -354,7 +354,6 @@ static qp_end settle_one(scp_core *core, const double *known, double limit)
     multi_room *room = core->multi;
     const program *p = &room->program;
     solution *s = &room->solution;
-    int systems = 0, all = p->qp.nf + p->qp.pairs;
     if (known != NULL) {
         for (int k = 0; k < p->qp.pairs; k++)
             s->force[k] = known[at->nf + pair_of(core, &room->plan.pairs, k)];
@@ -362,12 +361,11 @@ static qp_end settle_one(scp_core *core, const double *known, double limit)
     } else {
         guess_active(p, room->plan.reaction, room->plan.force, s);
     }
-    qp_end end = settle(core, &p->qp, s, CHANGES, limit, &systems);
+    qp_end end = settle_in_time(core, p, CHANGES, limit, s);
     if (end != QP_UNSOLVED)
         return end;
-    memset(s->active, 0, (size_t)all * sizeof *s->active);
-    memset(s->relaxed, 0, (size_t)all * sizeof *s->relaxed);
-    return settle(core, &p->qp, s, MOST_CHANGES, limit, &systems);
+    guess_nothing(p, s);
+    return settle_in_time(core, p, MOST_CHANGES, limit, s);
 }
 
 /* Whether obstacles yield at the solution of a program. */

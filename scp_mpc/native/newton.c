@@ -512,8 +512,7 @@ nominal *restored(scp_core *core, const nominal *plan, nominal *one, nominal *ot
             break;
         write_program(core, plan, &p->c, &plan->planes, RELAX_NONE, NULL, p);
         centre(core, p);
-        memset(s->active, 0, (size_t)(p->qp.nf + p->qp.pairs));
-        memset(s->relaxed, 0, (size_t)(p->qp.nf + p->qp.pairs));
+        guess_nothing(p, s);
         if (settle(core, &p->qp, s, MOST, INFINITY, &systems) != QP_SOLVED)
             break;
         axpy(core->at.nv, 1.0, p->c.here, s->v);

@@ -406,27 +406,34 @@ void guess_active(const program *p, const double *reaction, const double *force,
     }
 }
 
-static qp_end attempt(scp_core *core, const program *p, int changes, solution *to)
+/* `settle`, with as many changes as there is time for. */
+qp_end settle_in_time(scp_core *core, const program *p, int changes, double limit, solution *to)
 {
     int systems = 0, most = room_for(core, TASK_REPAIR, changes, TASK_NONE, 0);
     lap began = mark_time(core);
-    qp_end end = settle(core, &p->qp, to, most, INFINITY, &systems);
+    qp_end end = settle(core, &p->qp, to, most, limit, &systems);
     learn_time(core, TASK_REPAIR, began, systems);
     return end;
+}
+
+/* No constraint is active. */
+void guess_nothing(const program *p, solution *to)
+{
+    memset(to->active, 0, (size_t)(p->qp.nf + p->qp.pairs) * sizeof *to->active);
+    memset(to->relaxed, 0, (size_t)(p->qp.nf + p->qp.pairs) * sizeof *to->relaxed);
 }
 
 /* Solve a program from a plan and its multipliers, or else from nothing. */
 program_end solve_program(scp_core *core, const program *p, const nominal *from, solution *to)
 {
     guess_active(p, from->reaction, from->force, to);
-    qp_end end = attempt(core, p, CHANGES, to);
+    qp_end end = settle_in_time(core, p, CHANGES, INFINITY, to);
     if (end == QP_UNSOLVED) {
         if (!allows(core, TASK_LONGER_RUN))
             return PROGRAM_LATE;
         lap began = mark_time(core);
-        memset(to->active, 0, (size_t)(p->qp.nf + p->qp.pairs));
-        memset(to->relaxed, 0, (size_t)(p->qp.nf + p->qp.pairs));
-        end = attempt(core, p, MOST_CHANGES, to);
+        guess_nothing(p, to);
+        end = settle_in_time(core, p, MOST_CHANGES, INFINITY, to);
         learn_time(core, TASK_LONGER_RUN, began, 1);
     }
     core->out.solved += end == QP_SOLVED;
