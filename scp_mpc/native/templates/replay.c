@@ -17,7 +17,7 @@ static void compare(const double *found, const double *expected, int count)
         if (!(off <= apart) && !isnan(apart)) /* no number is the largest of all */
             apart = off;
     }
-    bits = bits && !memcmp(found, expected, (size_t)count * sizeof *found);
+    bits = bits && !(count && memcmp(found, expected, (size_t)count * sizeof *found));
 }
 
 static void write(const scp_problem *problem, const vector *given, scp_inputs *in)
@@ -27,6 +27,8 @@ static void write(const scp_problem *problem, const vector *given, scp_inputs *i
     memcpy(in->x0, given->x0, nx * number);
     memcpy(in->x_ref, given->x_ref, (N + 1) * nx * number);
     in->count = given->count;
+    if (!J)
+        return;
     memcpy(in->means, given->means, J * (N + 1) * d * number);
     memcpy(in->covariances, given->covariances, J * (N + 1) * d * d * number);
     memcpy(in->radii, given->radii, J * number);
