@@ -192,8 +192,8 @@ static void plan(scp_core *core)
         seek_afresh(core);
 }
 
-/* Follow the backup of an earlier plan. What ignores the obstacles stays, or is the plan that was not
- * followed. */
+/* Follow the backup of an earlier plan. What ignores the obstacles stays, or is the plan that was
+ * not followed. */
 static void follow(scp_core *core, const result *earlier)
 {
     scp_outputs *out = &core->out;

@@ -1,4 +1,5 @@
-/* Sequential convex programming: the loop. scp_mpc/scp/loop.py, trust_region.py, and judge of plan.py.
+/* Sequential convex programming: the loop. scp_mpc/scp/loop.py, trust_region.py, and judge of
+ * plan.py.
  *
  *     now      the plan to start from
  *     repeat:  linearise   the dynamics about the plan
@@ -12,16 +13,15 @@
  *
  * For a linear robot half-spaces are sound about any point, and all plans are accepted. For a
  * nonlinear robot a trust region bounds what the inputs change by; the merit that decides is cost
- * and penalty on all violations, whose weight exceeds the forces met so far.
- */
+ * and penalty on all violations, whose weight exceeds the forces met so far. */
 #include "core.h"
 
 static const double SURPLUS = 0.1;    /* of the tolerance: worth one more iteration */
-static const double LEAST_COST = 1e-3; /* relative to which products of forces and gaps are judged */
+static const double LEAST_COST = 1e-3; /* relative to which products of forces are judged */
 static const int PATIENCE = 3;        /* iterations before a run towards a goal is given up */
 static const double FAR = 1.1;        /* share of the goal's merit above which it is */
-static const double NEARLY = 0.01;    /* [m]: a violation that steps onto the constraints may mend */
-static const double ALIKE = 0.01;     /* relative difference of cost of plans that may become the same */
+static const double NEARLY = 0.01;    /* [m]: a violation that may be mended */
+static const double ALIKE = 0.01;     /* relative difference of plans that may become the same */
 static const double CLOSE = 0.1;      /* share of the inputs' range that lies between those */
 static const double NEGLIGIBLE = 1e-6; /* force that is none */
 static const double FLAT = 1e-6;      /* of the largest curvature: the certificate's tolerance */
@@ -55,7 +55,8 @@ void lay_out_loop(scp_core *core, arena *from)
     l.about.y = doubles(from, (size_t)at->ny);
     l.about.g = doubles(from, (size_t)at->most_pairs);
     l.about.a = doubles(from, (size_t)(at->most_pairs * (at->d + 1)));
-    l.about.bend = doubles(from, (size_t)(core->p.max_shapes ? at->most_pairs * at->d * (at->d - 1) : 0));
+    int bends = core->p.max_shapes ? at->d * (at->d - 1) : 0;
+    l.about.bend = doubles(from, (size_t)(at->most_pairs * bends));
     l.span = doubles(from, (size_t)at->n);
     l.radius = doubles(from, (size_t)at->n);
     l.direction = doubles(from, (size_t)at->n);
@@ -142,7 +143,8 @@ static int shrinks(const scp_core *core, trust_region *trust, const nominal *now
     const loop_room *l = core->loop;
     double most = 0.0;
     for (int i = 0; i < at->n; i++) {
-        double u = p->c.y_free[at->u + i] + dot(at->nv, p->c.by->S + (at->u + i) * at->nv, refined->v);
+        const double *row = p->c.by->S + (at->u + i) * at->nv;
+        double u = p->c.y_free[at->u + i] + dot(at->nv, row, refined->v);
         double change = fabs(u - now->y[at->u + i]) / l->span[i];
         most = change <= most ? most : change; /* or NaN */
     }

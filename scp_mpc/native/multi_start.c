@@ -3,11 +3,10 @@
  *
  * All are ranked by the programs that linearise about them, solved as far as they can win: the dual
  * objective bounds a program's optimum from below, and so do the multipliers that the same one had
- * one control step before. The best are followed to their end, and win if they are better by enough.
- * Where the plan needs slack, more are followed until one does not. Waiting in front of an obstacle
- * is cheap over a short horizon, which does not show what it costs in the end: it has to promise
- * half of the plan's cost.
- */
+ * one control step before. The best are followed to their end, and win if they are better by
+ * enough. Where the plan needs slack, more are followed until one does not. Waiting in front of an
+ * obstacle is cheap over a short horizon, which does not show what it costs in the end: it has to
+ * promise half of the plan's cost. */
 #include "core.h"
 
 /* It must be better by this share, or the plan flickers between candidates of equal cost. */
@@ -346,8 +345,8 @@ static void keep_known(const scp_core *core, const double *known, ranked *one)
         one->force[at->nf + pair_of(core, of, k)] = known[at->nf + pair_of(core, of, k)];
 }
 
-/* Solve a program from the multipliers of the step before, or those of the plan that is there; where
- * that leads nowhere, from none. */
+/* Solve a program from the multipliers of the step before, or those of the plan that is there;
+ * where that leads nowhere, from none. */
 static qp_end settle_one(scp_core *core, const double *known, double limit)
 {
     const layout *at = &core->at;
@@ -506,7 +505,8 @@ static int vary(scp_core *core, int beam, int most)
     for (int i = 0; i < beam && count < most; i++)
         if (!room->beam[i].varied) {
             passing(core, &room->beam[i], path, touched);
-            count += varied(core, path + at->d, touched, most - count, room->variations + count * size);
+            count += varied(core, path + at->d, touched, most - count,
+                            room->variations + count * size);
         }
     for (int i = 0; i < beam; i++)
         room->beam[i].varied = 1;
@@ -518,8 +518,9 @@ static int vary(scp_core *core, int beam, int most)
     return count;
 }
 
-/* Among polytopes, which face to pass at which stage is a search: the best few of all. Each is varied
- * by one face at one stage, as long as that finds better ones. Returns how many are in the beam. */
+/* Among polytopes, which face to pass at which stage is a search: the best few of all. Each is
+ * varied by one face at one stage, as long as that finds better ones. Returns how many are in the
+ * beam. */
 static int search(scp_core *core, const result *best, int count, const ranked *base)
 {
     multi_room *room = core->multi;
@@ -578,7 +579,8 @@ static void challenge(scp_core *core, const ranked *one, int hard, result *best)
 
 /* A plan with slack is beaten by any without, and one that costs far more by others: then more
  * candidates are worth their time. */
-static void follow(scp_core *core, int count, ranked *const *order, int most, int safe, result *best)
+static void follow(scp_core *core, int count, ranked *const *order, int most, int safe,
+                   result *best)
 {
     for (int k = 0; k < count && !core->broken; k++) {
         const ranked *one = order[k];
@@ -614,8 +616,8 @@ static void note(scp_core *core, int count)
 }
 
 /* Rank the candidates past the obstacles by one program each; follow the best of them. Among
- * polytopes the search is thorough where there is no plan from the step before, or where the one that
- * is there is not safe.
+ * polytopes the search is thorough where there is no plan from the step before, or where the one
+ * that is there is not safe.
  *
  * best: the plan that is there, replaced if another one wins. free_path: (C, d) of the plan that
  * ignores the obstacles. has_last: whether there is a plan from the step before. */
@@ -625,7 +627,8 @@ void multi_start(scp_core *core, result *best, const double *free_path, int has_
     const double *known[SCP_MOST_CANDIDATES] = {NULL};
     ranked *order[SCP_MOST_CANDIDATES];
     int safe = is_ok(best->status), thorough = core->now->has_shapes && (!has_last || !safe);
-    int most = room_for(core, TASK_CANDIDATE, thorough ? MOST_AMONG_WALLS : MOST, TASK_ITERATION, 0);
+    int most = thorough ? MOST_AMONG_WALLS : MOST;
+    most = room_for(core, TASK_CANDIDATE, most, TASK_ITERATION, 0);
     room->made.count = 0;
     if (!most)
         return;
@@ -649,7 +652,7 @@ void multi_start(scp_core *core, result *best, const double *free_path, int has_
                rank(core, best, thorough, count, room->base, known));
     room->made.count = count;
     note(core, count);
-    int follows = core->p.max_candidates + (thorough ? BEAM - 1 : 0); /* some lead to where we are */
+    int follows = core->p.max_candidates + (thorough ? BEAM - 1 : 0); /* some lead here again */
     int beam = thorough ? search(core, best, count, room->base) : 0;
     int few = beam ? sorted(beam, room->beam, order) : sorted(count, room->base, order);
     follow(core, few, order, follows, safe, best);

@@ -7,11 +7,11 @@
  *
  *     (I - T)^-1 d = d + P F'(I - F P F')^-1 F d,    P = I - A'(A A')^-1 A
  *
- * and I - F P F' is positive definite: the second-order condition. Where the dynamics bend, too, the
- * Lagrangian's second derivative is I + W, and Newton's step goes on from the convex one within the
- * null space of A: P (I + W) P z = -P W d. Where it would leave the active set, the program is solved
- * again with that second derivative for its Hessian, negative curvature replaced by a little that
- * is positive.
+ * and I - F P F' is positive definite: the second-order condition. Where the dynamics bend, too,
+ * the Lagrangian's second derivative is I + W, and Newton's step goes on from the convex one within
+ * the null space of A: P (I + W) P z = -P W d. Where it would leave the active set, the program is
+ * solved again with that second derivative for its Hessian, negative curvature replaced by a little
+ * that is positive.
  *
  * Notation:
  *     d   (nv,)       step of the condensed problem
@@ -23,10 +23,10 @@
 
 static const double STEPS[] = {0.5, 0.1, 0.02}; /* of the inputs' range, to leave a saddle */
 static const double LESS = 1e-9;       /* relative fall of the merit that is none */
-static const double FLAT = 0.1;        /* least curvature of a program, relative to that of the cost */
+static const double FLAT = 0.1;        /* least curvature of a program; that of the cost is one */
 static const double NEGLIGIBLE = 1e-6; /* force that is none */
 static const double TOUCH = 1e-7;      /* distance to a constraint that counts as none */
-static const double TOLERANCE = 1e-6;  /* of the largest curvature: what is less is taken for flat */
+static const double TOLERANCE = 1e-6;  /* of the largest curvature: what is less is flat */
 enum {
     CHANGES = 30,     /* of the active set, in a program with the Lagrangian's Hessian */
     RESTORATIONS = 3, /* steps, */
@@ -324,7 +324,7 @@ static const solution *newton_step(scp_core *core, const program *p, const solut
 /* ---- where the active set changes on the way */
 
 /* Solve a program again with the Lagrangian's own Hessian H = C'C; NULL where that is not reached.
- * The objective is |w|^2 / 2 in w = C (v - here) + C^-T here, and origin (nv,) is here - H^-1 here. */
+ * The objective is |w|^2 / 2 in w = C (v - here) + C^-T here; origin (nv,) is here - H^-1 here. */
 static const solution *newton_program(scp_core *core, const program *p, const metric *by,
                                       const solution *from)
 {
@@ -531,8 +531,8 @@ nominal *restored(scp_core *core, const nominal *plan, nominal *one, nominal *ot
 
 /* ---- second-order condition */
 
-/* Rows (k, nv) of the constraints that are active, towards where they allow to go, with forces (k,):
- * those that hold, then those without a force, weakly active. */
+/* Rows (k, nv) of the constraints that are active, towards where they allow to go, with forces
+ * (k,): those that hold, then those without a force, weakly active. */
 static int active_rows(scp_core *core, const program *p, const solution *s, double *rows,
                        double *force)
 {
@@ -558,8 +558,8 @@ static int active_rows(scp_core *core, const program *p, const solution *s, doub
 
 /* A plan's least curvature becomes known, and the direction (N, nu) of it in inputs.
  *
- * p: the program that led to it; at a KKT point the two agree to first order. s: its solution, which
- * knows the active set. */
+ * p: the program that led to it; at a KKT point the two agree to first order. s: its solution,
+ * which knows the active set. */
 void second_order(scp_core *core, const program *p, const solution *s, nominal *plan,
                   double *direction)
 {
@@ -597,8 +597,8 @@ static double merit(const scp_core *core, const nominal *n)
     return merit_of(core, n->cost, depth, n->excess);
 }
 
-/* Leave a saddle along a direction (N, nu) of negative curvature; 0 where that is in vain. The first
- * of some ever shorter steps, to either side, after which the merit is less. */
+/* Leave a saddle along a direction (N, nu) of negative curvature; 0 where that is in vain. The
+ * first of some ever shorter steps, to either side, after which the merit is less. */
 int negative_curvature_step(scp_core *core, const nominal *saddle, const double *direction,
                             nominal *to)
 {

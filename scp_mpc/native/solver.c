@@ -9,12 +9,11 @@
  *     multi-start  where an obstacle shapes the plan, the same from paths on its other sides;
  *                  the best plan wins, if by enough
  *     allocate     where a joint risk is promised, give it to those who need it, and go on
- *     fallback     without a plan that meets every constraint, the previous one, or braking, or what
- *                  is no faster than braking where it violates one
+ *     fallback     without a plan that meets every constraint, the previous one, or braking, or
+ *                  what is no faster than braking where it violates one
  *
  * Between the nodes of a plan radii leave room for what its motion there is assumed to be; a plan
- * that moves otherwise is sought again, with what it does for the assumption.
- */
+ * that moves otherwise is sought again, with what it does for the assumption. */
 #include "core.h"
 
 enum {
@@ -92,7 +91,7 @@ static void motion_of(const scp_core *core, const scp_iterate *it, motion *m)
     nodes_motion(core, core->at.nodes, it->states, it->inputs, m);
 }
 
-/* The step's radii leave room for what happens between the nodes; where that is nothing, they stay. */
+/* The step's radii leave room for what happens between the nodes, if anything does. */
 static void widen(scp_core *core, const motion *m)
 {
     core->now = &core->plain;
@@ -162,8 +161,8 @@ static int starts(scp_core *core)
 }
 
 /* Where its search begins: the better of the last plan and the last one that ignored the obstacles.
- * Where an obstacle shaped the last plan, only the sides of the obstacles are sought, and one program
- * about it has to do. */
+ * Where an obstacle shaped the last plan, only the sides of the obstacles are sought, and one
+ * program about it has to do. */
 static const nominal *last_start(scp_core *core, const scp_iterate *last, const scp_iterate *free)
 {
     solver_room *room = core->solver;
@@ -181,8 +180,8 @@ static const nominal *last_start(scp_core *core, const scp_iterate *last, const 
     return merit < merit_of(core, start->cost, 0.0, start->excess) ? other : start;
 }
 
-/* For a linear robot a few linear systems find it. For a nonlinear one the loop does; manoeuvres are
- * tried where there is no last plan, or where it would stand short of its goal. */
+/* For a linear robot a few linear systems find it. For a nonlinear one the loop does; manoeuvres
+ * are tried where there is no last plan, or where it would stand short of its goal. */
 static void obstacle_free(scp_core *core, const scp_iterate *last, const scp_iterate *last_free)
 {
     solver_room *room = core->solver;
@@ -254,8 +253,8 @@ static void reallocate(int count, const double *used, double *risks)
     scale(count, total / sum, risks);
 }
 
-/* Improve a plan that keeps a joint risk in equal shares. It stays feasible from one allocation to the
- * next, so that its cost cannot rise. Returns whether another plan came out. */
+/* Improve a plan that keeps a joint risk in equal shares. It stays feasible from one allocation to
+ * the next, so that its cost cannot rise. Returns whether another plan came out. */
 static int allocate(scp_core *core, result *best)
 {
     const layout *at = &core->at;
@@ -338,8 +337,8 @@ void write_plan(scp_core *core, const result *best)
     copy_iterate(core, &best->it, &out->plan);
 }
 
-/* The loop from a start, and what comes after it: alternatives, allocation, fallback. Returns whether
- * the alternatives' multipliers belong to the plan that comes out. */
+/* The loop from a start, and what comes after it: alternatives, allocation, fallback. Returns
+ * whether the alternatives' multipliers belong to the plan that comes out. */
 static int descend(scp_core *core, const scp_iterate *start, const double *about,
                    const scp_iterate *last, int multi, int brake_first, lap *ending)
 {

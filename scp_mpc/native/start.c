@@ -1,4 +1,5 @@
-/* Where a nonlinear robot's search begins: the best of simple manoeuvres; scp_mpc/scp/manoeuvres.py.
+/* Where a nonlinear robot's search begins: the best of simple manoeuvres;
+ * scp_mpc/scp/manoeuvres.py.
  *
  * A local search ends in the next stationary point, and standing often is one: to first order it
  * brings nothing to turn towards a goal behind. So some plans are tried that hold one corner of the
@@ -129,7 +130,8 @@ static void drive(scp_core *core, int W, const double *values, uint8_t *level, d
         for (int w = 0; w < W; w++) {
             rest_outside(core, x + w * nx, values, level + (w * at->N + k) * nu, u + w * nu,
                          after + w * nx, tried);
-            cost[w] += weighed(nx, Q, after + w * nx, wanted) + weighed(nu, p->R, u + w * nu, p->rest);
+            cost[w] += weighed(nx, Q, after + w * nx, wanted);
+            cost[w] += weighed(nu, p->R, u + w * nu, p->rest);
         }
         memcpy(x, after, (size_t)(W * nx) * sizeof *x);
     }

@@ -130,8 +130,8 @@ static void fill(int n, double value, double *a)
         a[i] = value;
 }
 
-/* The residuals of a plan whose y, roll, reaction, pairs and force are there. Who yields has a slack
- * that is not zero; NULL for nobody. */
+/* The residuals of a plan whose y, roll, reaction, pairs and force are there. Who yields has a
+ * slack that is not zero; NULL for nobody. */
 void judge_plan(scp_core *core, nominal *n, const uint8_t *yields, relaxation level)
 {
     find_planes(core, core->now, &n->pairs, n->y, &n->planes);
@@ -175,8 +175,8 @@ int plain_nominal(scp_core *core, const double *U, const double *guess_e, nomina
     return 0;
 }
 
-/* Where the loop may roll an iterate out from: its inputs and deviations, with feedback from a state
- * that a disturbance has moved. */
+/* Where the loop may roll an iterate out from: its inputs and deviations, with feedback from a
+ * state that a disturbance has moved. */
 static int led_back(scp_core *core, const scp_iterate *it, double *U, double *e)
 {
     const layout *at = &core->at;
