@@ -18,7 +18,6 @@ from scp_mpc import MPC, Settings, export
 
 NATIVE = Settings(solver="native", deadline=None)
 FUZZ = Path(__file__).parent / "fuzz.c"
-FOUND = sorted((Path(__file__).parent / "found").glob("*"))
 MATHEMATICS = re.compile(
     "a?(cos|sin|tan)|atan2|ceil|erfc?|expm?[12]?|fabs|floor|fmax|fmin|fmod|hypot|ldexp|log(1p)?|"
     "nearbyint|pow|round|sincos|sqrt|tanh|trunc"
@@ -100,12 +99,6 @@ def fuzz(sanitized, tmp_path_factory):
 def test_nothing_random_brings_it_down(fuzz, seed):
     """Sanitizers watch, walls are around its blocks, every call is made twice; see fuzz.c."""
     run(fuzz, seed, 1000, timeout=1800)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("string", FOUND, ids=lambda path: path.name)
-def test_what_was_found_stays_mended(fuzz, string):
-    run(fuzz, string, timeout=60)
 
 
 @pytest.mark.slow
