@@ -50,6 +50,7 @@ def test_least_and_plain_times_by_hand(tmp_path):
     mine, ghost = rows(3, repeats=2, courses=SHORT, store=tmp_path / "race.jsonl")
     assert mine["least_us"] == pytest.approx({"median": 1e3, "p99": 3.94e3, "max": 4e3})
     assert mine["processor_us"]["max"] == pytest.approx(2e3)
+    assert mine["first_us"] == pytest.approx(500)
     assert mine["plain_us"]["median"] == pytest.approx(2.5e3)
     assert mine["plain_us"]["max"] == pytest.approx(6e3)
     assert (mine["steps"], mine["repeats"], mine["failures"]) == (3, 2, 1)
