@@ -328,13 +328,14 @@ class Step:
         """How deep a path (C, d) enters the no-go sets at sizes s (M,): (J, C) [m]."""
         now = self.x0[self.problem.model.position]
         depths = np.zeros((self.count, len(path)))
-        near = self.within(np.concatenate([now[None], path]), s, 0.0)
+        whole = np.concatenate([now[None], path])
+        near = self.within(whole, s, 0.0)
         if near is not None:
             j, i = np.nonzero(near)
             covariances = self.covariances[j, i + 1]
             shapes = None if self.shapes is None else self.shapes.taken(j)
             sets = NoGoSets.pairs(self.means[j, i + 1], covariances, self.radii[j, i], shapes)
-            before = path[i - 1] - self.means[j, i]
+            before = whole[i] - self.means[j, i]
             g = self.problem.no_go.linearise(sets, path[i][:, None], s[j], before).value
             depths[j, i] = np.maximum(0.0, -g[:, 0])
         return depths
