@@ -207,10 +207,8 @@ class Acados:
         require_round(step.obstacles)
         start, data = as_iterate(guess, self.problem), self._data
         data.X[:], data.U[:], data.S[:] = start.states, start.inputs, start.s
-        means = np.array([o.means for o in step.obstacles])
-        covariances = np.array([o.covariances for o in step.obstacles])
-        radii = np.array([o.radius for o in step.obstacles])
-        data.write(step.x0, step.x_ref, means, covariances, radii, False)
+        told = step.obstacles
+        data.write(step.x0, step.x_ref, told.means, told.covariances, told.radii, False)
         status = self._call(self._solver, data.address)
         return PeerPlan.judged(
             self.problem,

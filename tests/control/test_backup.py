@@ -4,9 +4,19 @@ import time
 
 import numpy as np
 import pytest
+from native import needs_core
 
 from benchmarks.safety import episode
-from scp_mpc import MPC, DoubleIntegrator, ObstaclePrediction, Polytope, Problem, Status, Unicycle
+from scp_mpc import (
+    MPC,
+    DoubleIntegrator,
+    ObstaclePrediction,
+    Polytope,
+    Problem,
+    Settings,
+    Status,
+    Unicycle,
+)
 from scp_mpc.control import mpc as module
 from scp_mpc.control.backup import Backup
 
@@ -139,14 +149,15 @@ def _keeps_its_promise(seed, moving):
     assert row["contact"] is None, seed
 
 
+@pytest.mark.parametrize("solver", ["osqp", pytest.param("native", marks=needs_core)])
 @pytest.mark.parametrize("limit", ["wall", "wall and speed"])
 @pytest.mark.parametrize("model", [DoubleIntegrator(0.1), Unicycle(0.1)], ids=["point", "car"])
-def test_a_robot_stops_at_the_end_of_its_room(model, limit):
+def test_a_robot_stops_at_the_end_of_its_room(model, limit, solver):
     """Its horizon is shorter than what braking takes, and nothing else is there."""
     speed = 1.5 if limit != "wall" else None
     room = {"x_max": [3.0, np.inf, np.inf, np.inf], "speed_max": speed}
     problem = Problem(model, horizon=8, **{**KNOWN, **room})
-    mpc, x = MPC(problem), np.zeros(4)
+    mpc, x = MPC(problem, Settings(deadline=None, solver=solver)), np.zeros(4)
     for _ in range(60):
         plan = mpc.step(x, model.state(np.array([9.0, 0.0]), np.zeros(2)))
         assert plan.ok
